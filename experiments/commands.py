@@ -64,9 +64,6 @@ COMMANDS = {
     "sparse_layers": Command(
         "studies.sparse_layers:sparse_layers", "derivatives behind a network by three layers", long=True
     ),
-    "full_setting": Command(
-        "studies.full_setting:full_setting", "time that tasks save over the source's setting", long=True
-    ),
     "figures": Command("studies.figures:figures", "figures of the source, by their numbers", long=True),
     "gallery": Command("studies.gallery:gallery", "pictures and animations of all tasks", long=True),
     "caustic": Command("studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),

@@ -232,6 +232,17 @@ def in_default_type(z):
     return torch.full((len(z),), 1 / 3, dtype=torch.get_default_dtype())
 
 
+def counting(fn):
+    """Return fn, and a list to which every call appends how many points it is given, as its last argument."""
+    calls = []
+
+    def counted(*arguments):
+        calls.append(len(arguments[-1]))
+        return fn(*arguments)
+
+    return counted, calls
+
+
 class Scaled:
     """Points times a factor that the caller may change."""
 

@@ -48,9 +48,9 @@ def rays(z):
     return (powers.sum(2) + torch.sin(0.3 * powers).sum(2)).unflatten(1, (2, 3))
 
 
-def rays_loss(n, dtype=torch.float64):
+def rays_loss(n):
     """The loss of an output of `rays` for n parameters, 0 at 1."""
-    target = rays(torch.ones(1, n, dtype=dtype))[0]
+    target = rays(torch.ones(1, n, dtype=torch.float64))[0]
     return lambda output: (output - target).square().mean()
 
 
@@ -72,9 +72,24 @@ def bar(z):
     return ((torch.linspace(-6, 6, 40, dtype=torch.float64) - z[:, :1]).abs() < 1.0).double()
 
 
+def bars(places):
+    """Pictures [K, m] with hard edges of z [K, 2]: a bar around z[0] of a half width that grows with z[1]."""
+    return lambda z: ((places - z[:, :1]).abs() < 0.2 + 0.1 * z[:, 1:]).double()
+
+
 def bump(x):
     """A smooth picture [K, 40]: a bump that is where x [K, 1] says."""
     return torch.exp(-0.5 * ((torch.linspace(-6, 6, 40, dtype=torch.float64) - x[:, :1]) / 0.7).square())
+
+
+def half_space(z, weight):
+    """The minimum 3 of the distance to (1, 2, 3) is where x1 + x2 + x3 = 3."""
+    return (z - vector(1.0, 2.0, 3.0)).square().sum(1) + weight * (z.sum(1) - 3).clamp(min=0)
+
+
+def hyperbola(z, weight):
+    """The minimum 2 of x1 + x2 is where x1 x2 = 1."""
+    return z.sum(1) + weight * (1 - z[:, 0] * z[:, 1]).clamp(min=0)
 
 
 def spiral(x):
@@ -93,6 +108,12 @@ def misfit(f, solution):
     """The mean square of an output of f against the one at the solution."""
     target = f(solution[None])[0]
     return lambda y: (y - target).square().mean()
+
+
+def noisy(f, noise, seed):
+    """Return f with normal noise of this standard deviation, other numbers at every call."""
+    generator = torch.Generator().manual_seed(seed)
+    return lambda z: f(z) + noise * torch.randn(len(z), generator=generator, dtype=torch.float64)
 
 
 def run(search, f, evaluations, target=-math.inf, values=None):
@@ -130,6 +151,11 @@ N = SIDE**2
 def square(target):
     """The mean square of the difference from a target."""
     return lambda y: (y - target).square().mean()
+
+
+def sum_of_squares(target):
+    """The sum of squares of the difference from a target."""
+    return lambda y: (y - target).square().sum()
 
 
 def texels(x):

@@ -10,7 +10,7 @@ from experiments.problems.closed_forms import Bump, ClosedForm, Exponential, Pla
 
 __all__ = [
     *("Bump", "ClosedForm", "Exponential", "Image", "PlaneWave", "Quadratic", "Step"),
-    *("deviation", "normal", "spread", "truths", "vector"),
+    *("deviation", "doubles", "magnitudes", "normal", "spread", "squares", "truths", "vector"),
 ]
 
 
@@ -34,6 +34,20 @@ def vector(*numbers: float) -> Tensor:
 def normal(*shape: int, seed: int = 0) -> Tensor:
     """Return standard normal numbers of this shape, in float64."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def doubles(*shape: int) -> Tensor:
+    return torch.zeros(shape, dtype=torch.float64)
+
+
+def squares(z: Tensor) -> Tensor:
+    """Return the sum of squares of every row."""
+    return z.square().sum(1)
+
+
+def magnitudes(y: Tensor) -> Tensor:
+    """Return the sum of all magnitudes."""
+    return y.abs().sum()
 
 
 def spread(n: int, low: float, high: float) -> Tensor:

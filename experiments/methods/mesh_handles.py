@@ -1,9 +1,7 @@
 """Methods for the vertices of a mesh: smoothed derivatives, with knowledge of meshes and cameras around them.
 
-| method | perturbed | derivatives of | step |
-|---|---|---|---|
-| handles_adam | handles | the losses of the handles | Adam |
-| handles_newton, **recommended** | handles | the losses of the handles | Newton, a Hessian per handle; then Adam |
+`handles_newton` perturbs handles, and estimates derivatives of the losses of the handles. Its first steps are Newton
+steps with a Hessian per handle, later steps are steps of Adam.
 
 *Handles* are the vertices of a coarser mesh. Subdivision makes their displacements smooth. A run begins with few
 handles and goes on with more.
@@ -22,7 +20,6 @@ missing ear and a dark web beside an ear are local minima.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,7 +42,7 @@ DAMPING = 0.5
 def handles(
     trial: Trial,
     *,
-    newton: int = 0,
+    newton: int = 2,
     levels: tuple[int, ...] = LEVELS,
     steps: int = 80,
     samples: int = 8,
@@ -162,12 +159,13 @@ def is_mesh(task: Task) -> str | None:
     return None if task.output and task.output.residuals else "the black box returns no residuals"
 
 
-def _method(name: str, title: str, **fixed: Any) -> Method:
-    uses = "image, cameras, triangles"
-    return Method(name, title, with_settings(handles, **fixed), is_mesh, ("scipy",), uses=uses)
-
-
 METHODS = (
-    _method("handles_newton", "ours for meshes: Newton, then Adam, a loss per handle", newton=2),
-    _method("handles_adam", "Adam, a loss per handle of a mesh"),
+    Method(
+        "handles_newton",
+        "ours for meshes: Newton, then Adam, a loss per handle",
+        with_settings(handles),
+        is_mesh,
+        ("scipy",),
+        uses="image, cameras, triangles",
+    ),
 )

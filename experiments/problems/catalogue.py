@@ -4,10 +4,9 @@ import difflib
 import importlib
 import importlib.util
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset, Task
@@ -19,7 +18,6 @@ _SHARED = {
     "texture100": "texture",
     "texture317": "texture",
     "caustic64": "caustic",
-    "cnn_wide": "cnn",
     **dict.fromkeys(("meshfit_color", "suzanne", "banana"), "meshfit"),
 }
 """Tasks without a module of their own: the module that has the function of their name."""
@@ -40,9 +38,15 @@ RENDERED = _targets("mug", "shad", "bunny", "mirror", "poster")
 """Those of them that Mitsuba renders: functions `(preset, variant) -> Task`."""
 FITTING |= RENDERED
 RENDERED_NETWORKS = ("cnn", "cnn_wide", "cnn5", "cnn_texture")
-NETWORKS = _targets(*RENDERED_NETWORKS, "cnn_throw")
-"""Tasks whose unknowns are the weights of a network before the black box: functions
-`(preset, variant, threads) -> NetworkTask`."""
+NETWORKS = {
+    "cnn": "experiments.problems.tasks.cnn:Rotation",
+    "cnn_wide": "experiments.problems.tasks.cnn:WideRotation",
+    "cnn5": "experiments.problems.tasks.cnn5:PoseAndColor",
+    "cnn_texture": "experiments.problems.tasks.cnn_texture:Texture",
+    "cnn_throw": "experiments.problems.tasks.cnn_throw:Throw",
+}
+"""Tasks whose unknowns are the weights of a network before the black box: classes, whose sizes are in `SIZES` of their
+module."""
 SIMULATED = ("throw", "cnn_throw")
 """Tasks that MuJoCo simulates."""
 TASKS = FITTING | NETWORKS
@@ -59,11 +63,13 @@ def load(name: str, preset: Preset = "fast", variant: str = "auto", threads: int
         variant: of Mitsuba, where it renders.
         threads: that render the images of a network task, all cores if None. A fitting task has one.
     """
-    more: tuple[Any, ...] = (variant,) if name in RENDERED else (variant, threads) if name in NETWORKS else ()
+    where, _, name_there = TASKS[name].partition(":")
     with _packages_of(name):
-        module, _, function = TASKS[name].partition(":")
-        task: Task | NetworkTask = getattr(importlib.import_module(module), function)(preset, *more)
-    return task
+        module = importlib.import_module(where)
+        made: Callable[..., Task | NetworkTask] = getattr(module, name_there)
+        if name in NETWORKS:
+            return made(module.SIZES[preset], variant, threads)
+        return made(preset, variant) if name in RENDERED else made(preset)
 
 
 def fitting(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:

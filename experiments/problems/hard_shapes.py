@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Picture, Task, Truth, least_squares
+from experiments.problems.task import Picture, Task, Truth, differences_from, least_squares
 
 SIDE = 64
 """Pixels along the image side."""
@@ -55,7 +55,7 @@ def fitting(
         loss=loss,
         evaluations=20_000,
         truth=Truth(lambda x: float(loss(x[None])[0]), parameter_error),
-        output=least_squares(image, lambda out: (out - reference).flatten()),
+        output=least_squares(image, differences_from(reference)),
         picture=Picture(lambda x: image(x[None])[0].clamp(max=1.0), lambda: reference),
         **given,
     )

@@ -65,10 +65,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Renderer:
-    """The program behind the black box: its own derivative, and when it is loaded and freed.
-
-    A task that has one leaves out something of the source's setting in preset "fast", and nothing in preset "paper".
-    """
+    """The program behind the black box: its own derivative, and when it is loaded and freed."""
 
     adjoint: Callable[[Tensor, str, int], tuple[Tensor, Tensor]] | None = None
     """x [n], one of `adjoints` and the seed of the adjoint pass -> loss [], gradient [n].
@@ -120,6 +117,20 @@ class Task:
 def least_squares(image: Callable[[Tensor], Tensor], residuals: Callable[[Tensor], Tensor]) -> Output:
     """Output whose loss is mean(residuals^2)."""
     return Output(image, lambda out: residuals(out).square().mean(), residuals)
+
+
+def differences_from(reference: Tensor) -> Callable[[Tensor], Tensor]:
+    """Residuals of an output [*out], for `least_squares`: its differences from a reference [*out]."""
+    return lambda out: (out - reference).flatten()
+
+
+def assigned_error(x: Tensor, places: Tensor) -> float:
+    """Mean squared error of interchangeable things x [m c] that are to be at places [m, c], least over assignments."""
+    from scipy.optimize import linear_sum_assignment
+
+    distance = (x.view(-1, 1, places.shape[1]) - places).square().sum(2)
+    found, taken = linear_sum_assignment(distance.numpy())
+    return float(distance[torch.from_numpy(found), torch.from_numpy(taken)].sum()) / len(x)
 
 
 def uniform(lower: Tensor, upper: Tensor) -> Callable[[int], Tensor]:

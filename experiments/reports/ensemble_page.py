@@ -2,7 +2,6 @@
 
 import base64
 import io
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +19,6 @@ from experiments.reports import error_curves
 from experiments.reports.animation import pixels
 from experiments.reports.html_page import html_page, html_table, html_text
 from experiments.reports.results import Run, first_run, load
-from experiments.reports.savings import kept_saving
 from experiments.reports.similarity import described, measures
 from experiments.reports.speed_ups import HEADERS
 from experiments.reports.summary import Summary, summarize, task_table
@@ -65,7 +63,7 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         parts += [f"<h2 id='{html_text(name)}'>{html_text(name)}</h2>", _about(task), _tables(summary, name)]
         parts.append(_curves(name, methods, chosen))
         if task is not None:
-            parts += [_pictures(task, *first_run(task, methods)), _left_out(task, preset, folder)]
+            parts.append(_pictures(task, *first_run(task, methods)))
         parts.append(_settings(settings))
     title = f"Results of {', '.join(results.runs)}"
     if summary.unfinished:
@@ -144,18 +142,6 @@ def _pictures(task: Task, run: int, ends: Mapping[str, Tensor]) -> str:
 def _figure(name: str, picture: Tensor | None, caption: str) -> str:
     image = "" if picture is None else f"<img alt='{html_text(name)}' src='{_embedded(_png(picture))}'>"
     return f"<figure>{image}<figcaption><b>{html_text(name)}</b><br>{html_text(caption)}</figcaption></figure>"
-
-
-def _left_out(task: Task, preset: Preset, folder: Path) -> str:
-    """Say what the setting of the task saves over the source's."""
-    if task.renderer is None or preset == "paper":
-        return ""
-    found = (
-        kept_saving(folder / task.name)
-        or f"not measured: python -m experiments full_setting {shlex.quote(str(folder))}"
-    )
-    used = f"Used: {task.needs}. Against the full setting of the source: {found}."
-    return f"<h3>Left out</h3><p>{html_text(used)}</p>"
 
 
 def _settings(settings: Mapping[str, dict[str, Any]]) -> str:

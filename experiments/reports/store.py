@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Number
 from typing import Any
 
 import pandas as pd
@@ -63,7 +62,6 @@ def store(
     preset = whence["preset"]
     table = trained(results, preset) if networks else fitted(results, levels).merge(measured(results, preset), "left")
     table = table.assign(**whence)
-    table = table[[*(one for one in table if one not in result_files.ORIGIN), *result_files.ORIGIN]]
     print(result_files.write(_added(table, name) if add else table, name))
     if left := [task for task in there.runs if task not in wanted]:
         print(f"left out, although the command ran them: {', '.join(left)}")
@@ -74,17 +72,10 @@ def _added(table: pd.DataFrame, name: str) -> pd.DataFrame:
     old = result_files.read(name)
     old = old[~old["task"].isin(table["task"])]
     for one in _ALIKE:
-        values = dict.fromkeys(_plain(value) for part in (old, table) for value in part[one])
+        values = dict.fromkeys(result_files.plain(value) for part in (old, table) for value in part[one])
         if len(values) > 1:
             raise SystemExit(f"rows of one table must have one {one}, got {', '.join(one or 'none' for one in values)}")
     return pd.concat([old, table], ignore_index=True)
-
-
-def _plain(value: object) -> str:
-    """Return a value as it is in a file: 15 for 15.0, nothing where there is none."""
-    if pd.isna(value):
-        return ""
-    return f"{value:g}" if isinstance(value, Number) else str(value)
 
 
 def _ordered(results: Results) -> Results:

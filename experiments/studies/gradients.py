@@ -200,10 +200,10 @@ def _precise_loss(task: RenderedTask, spp: int) -> Callable[[Tensor], Tensor]:
     return loss
 
 
-def differences(loss: Callable[[Tensor], Tensor], x: Tensor, step: float, calls: int = 4) -> tuple[Tensor, Tensor]:
-    """Central differences [n] of loss(points [K, n]) at x [n], and their standard errors, from several calls."""
+def differences(loss: Callable[[Tensor], Tensor], x: Tensor, step: float) -> tuple[Tensor, Tensor]:
+    """Central differences [n] of loss(points [K, n]) at x [n], and their standard errors, from four calls."""
     offsets = step * torch.eye(len(x), dtype=x.dtype)
-    found = []
+    found, calls = [], 4
     for _ in range(calls):
         above, below = loss(torch.cat([x + offsets, x - offsets])).chunk(2)
         found.append((above - below) / (2 * step))

@@ -5,6 +5,7 @@ import itertools
 
 import pytest
 import torch
+from searches import bars, square
 
 import torch_zerohess as zh
 from torch_zerohess.sampling import kernels, proposals
@@ -123,19 +124,15 @@ def test_a_thousand_parameters_that_act_locally() -> None:
 
 @pytest.mark.parametrize("engine", ["auto", "descent", "gaussian_process"])
 def test_a_search_ends_on_the_device_of_its_start(engine: str) -> None:
-    place = torch.linspace(0, 1, 64, device=DEVICE)
-
-    def bar(x):
-        return ((place - x[:, :1]).abs() < 0.2 + 0.1 * x[:, 1:]).double()
-
-    wanted = bar(torch.tensor([[0.3, 0.5]], device=DEVICE))[0]
+    picture = bars(torch.linspace(0, 1, 64, device=DEVICE))
+    wanted = picture(torch.tensor([[0.3, 0.5]], device=DEVICE))[0]
     start = torch.tensor([0.8, 0.2], dtype=torch.float64, device=DEVICE)
     fit = zh.minimize(
-        bar,
+        picture,
         start,
         sigma=0.3,
         bounds=(0, 1),
-        loss=lambda y: (y - wanted).square().mean(),
+        loss=square(wanted),
         engine=engine,
         max_evaluations=150,
         seed=0,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import torch
+from black_boxes import counting
 from searches import CURVATURE, TARGET, tilted, zeros
 
 import torch_zerohess as zh
@@ -124,12 +125,7 @@ def test_an_output_of_one_point():
 
 
 def test_the_evaluator_makes_the_calls():
-    batches = []
-
-    def evaluator(fn, points):
-        batches.append(len(points))
-        return fn(points)
-
+    evaluator, batches = counting(lambda fn, points: fn(points))
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, evaluator=evaluator, max_evaluations=12)
     assert sum(batches) == fit.evaluations == 12
 

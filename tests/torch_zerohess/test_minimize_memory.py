@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from searches import raising, tilted, zeros
+from searches import noisy, raising, tilted, zeros
 
 import torch_zerohess as zh
 from truths import vector
@@ -110,13 +110,8 @@ def test_a_function_that_writes_to_its_points_does_not_change_a_memory():
 
 
 def test_what_repeats_for_noise_is_kept_too():
-    generator = torch.Generator().manual_seed(0)
     memory = zh.Memory()
-
-    def noisy(z):
-        return tilted(z) + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
-
-    fit = zh.minimize(noisy, zeros(2), memory=memory, **SETTINGS)
+    fit = zh.minimize(noisy(tilted, 0.1, 0), zeros(2), memory=memory, **SETTINGS)
     assert fit.noise > 0
     torch.testing.assert_close(memory.points, fit.points, rtol=0, atol=0)
     torch.testing.assert_close(memory.outputs, fit.values, rtol=0, atol=0)

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from searches import tilted, zeros
+from searches import bars, square, sum_of_squares, tilted, zeros
 
 import torch_zerohess as zh
 
@@ -20,8 +20,7 @@ def test_a_convex_function_ends_when_three_rounds_agree():
 CENTER = torch.tensor([0.4, -0.3], dtype=torch.float64)
 
 
-def identity_misfit(output):
-    return (output - CENTER).square().sum()
+identity_misfit = sum_of_squares(CENTER)
 
 
 @pytest.mark.parametrize(
@@ -157,14 +156,10 @@ def test_agreement_goes_on_from_a_state():
 )
 def test_a_plateau_beside_a_jump_is_not_solved(settings):
     """A bar with hard edges: images do not change when a parameter changes a little."""
-    pixels = torch.linspace(0.0, 1.0, 16, dtype=torch.float64)
-
-    def bars(z):
-        return ((pixels - z[:, :1]).abs() < 0.2 + 0.1 * z[:, 1:]).double()
-
-    goal = bars(torch.tensor([[0.3, 0.5]]))[0]
+    picture = bars(torch.linspace(0.0, 1.0, 16, dtype=torch.float64))
+    loss = square(picture(torch.tensor([[0.3, 0.5]]))[0])
     for seed in range(5):
-        fit = zh.minimize(bars, [0.8, 0.2], sigma=0.3, loss=lambda y: (y - goal).square().mean(), seed=seed, **settings)
+        fit = zh.minimize(picture, [0.8, 0.2], sigma=0.3, loss=loss, seed=seed, **settings)
         assert not fit.success or fit.value == 0.0
         assert fit.success or "may be no minimum" in fit.message
 

@@ -10,23 +10,14 @@ One channel is enough, as the squares are grey. The `fast` preset has 64x64 pixe
 500x500.
 """
 
-import torch
-from scipy.optimize import linear_sum_assignment
-from torch import Tensor
-
 from experiments.problems.soft_squares import box10
-from experiments.problems.task import Preset, Task
+from experiments.problems.task import Preset, Task, assigned_error
 from experiments.problems.tasks.box2 import fitting
 
 
 def task(preset: Preset = "fast") -> Task:
     box = box10({"fast": 64, "paper": 500}[preset])
     places = box.loss.target.view(-1, 2)
-
-    def parameter_error(x: Tensor) -> float:
-        distance = (x.view(-1, 1, 2) - places).square().sum(2)
-        squares, taken = linear_sum_assignment(distance.numpy())
-        return float(distance[torch.from_numpy(squares), torch.from_numpy(taken)].sum()) / len(x)
 
     return fitting(
         box,
@@ -35,5 +26,5 @@ def task(preset: Preset = "fast") -> Task:
         "starts (.41, .41) (.5, .5) (.59, .59) (.41, .59) (.59, .41) +- .025, "
         "solution (.21, .21) (.5, .5) (.79, .79) (.21, .79) (.79, .21)",
         evaluations=150_000,
-        parameter_error=parameter_error,
+        parameter_error=lambda x: assigned_error(x, places),
     )

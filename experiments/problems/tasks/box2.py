@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from experiments.problems.soft_squares import HALF_WIDTH, BoxTask, box2
-from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
+from experiments.problems.task import Picture, Preset, Task, Truth, differences_from, least_squares, uniform
 
 
 def task(preset: Preset = "fast") -> Task:
@@ -38,9 +38,6 @@ def fitting(
     squares = box.loss
     reference = squares.image(squares.target[None])[0]
 
-    def residuals(image: Tensor) -> Tensor:
-        return (image - reference).flatten()
-
     return Task(
         name=box.name.lower(),
         title=title,
@@ -53,6 +50,6 @@ def fitting(
         evaluations=evaluations,
         truth=Truth(lambda x: float(squares(x[None])[0]), parameter_error),
         bounds=(torch.full_like(box.start, HALF_WIDTH), torch.full_like(box.start, 1 - HALF_WIDTH)),
-        output=least_squares(squares.image, residuals),
+        output=least_squares(squares.image, differences_from(reference)),
         picture=Picture(lambda x: squares.image(x[None])[0], lambda: reference),
     )

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
+from experiments.problems.task import Picture, Preset, Task, Truth, differences_from, least_squares, uniform
 
 TARGET = (0.6, 0.25, 0.15, 0.5, 0.5, 0.4, 0.7)
 START = ((0.0,) * 7, (0.5,) * 6 + (0.3,))
@@ -80,9 +80,6 @@ def task(preset: Preset = "fast") -> Task:
     weights = weights / weights.sum()
     rows = max(1, _CHUNK // len(reference))
 
-    def residuals(pixels: Tensor) -> Tensor:
-        return (pixels - reference).flatten()
-
     def loss(x: Tensor) -> Tensor:
         return torch.cat([(sphere(part) - reference).square().mean((1, 2)) for part in x.split(rows)])
 
@@ -111,6 +108,6 @@ def task(preset: Preset = "fast") -> Task:
             lambda x: float(loss(x[None])[0]), lambda x: float((x - target).square().mean()), analytic=analytic
         ),
         bounds=(torch.zeros(7).double(), torch.ones(7).double()),
-        output=least_squares(sphere, residuals),
+        output=least_squares(sphere, differences_from(reference)),
         picture=Picture(lambda x: sphere.picture(sphere(x[None])[0]), lambda: sphere.picture(reference)),
     )

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from experiments.problems.scenes.caustic import COEFFICIENTS, Caustic
-from experiments.problems.task import Picture, Preset, Renderer, Task, Truth, least_squares
+from experiments.problems.task import Picture, Preset, Task, Truth, differences_from, least_squares
 
 TEXT = ("ZERO", "HESS")
 BACKGROUND = 0.3
@@ -62,9 +62,6 @@ def _slab(name: str, side: int, photons: int, coefficients: int, unit: float) ->
     def start(run: int) -> Tensor:
         return 0.3 * torch.randn(n, generator=torch.Generator().manual_seed(run), dtype=torch.float64)
 
-    def residuals(image: Tensor) -> Tensor:
-        return (image - target).flatten()
-
     def loss(x: Tensor) -> Tensor:
         return (caustic.image(x) - target).square().mean((1, 2))
 
@@ -80,9 +77,8 @@ def _slab(name: str, side: int, photons: int, coefficients: int, unit: float) ->
         evaluations=50_000,
         truth=Truth(lambda x: float(loss(x[None])[0]), lambda x: math.nan),
         bounds=(torch.full((n,), -LARGEST).double(), torch.full((n,), LARGEST).double()),
-        output=least_squares(caustic.image, residuals),
+        output=least_squares(caustic.image, differences_from(target)),
         picture=Picture(lambda x: (caustic.image(x[None])[0] / brightest).clamp(0, 1), lambda: target / brightest),
-        renderer=Renderer(),
     )
 
 

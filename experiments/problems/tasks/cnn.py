@@ -18,7 +18,6 @@ from torch import Tensor
 
 from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.scenes.mug import DEGREES, mug_scene
-from experiments.problems.task import Preset
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 SIZES = {
@@ -67,11 +66,3 @@ class WideRotation(Rotation):
     title = "the same from 250 degrees, with a plateau between the ends"
     sigma = (3.0, 0.1)
     angles, output = (6.5, 19.0), (3.5, 22.0)
-
-
-def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
-    return Rotation(SIZES[preset], variant, threads)
-
-
-def cnn_wide(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
-    return WideRotation(SIZES[preset], variant, threads)

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from experiments.problems.network_task import Encoder, NetworkTask
 from experiments.problems.scenes.mug import COLOR, DEGREES, POSE, mug_scene
-from experiments.problems.task import Preset
-from experiments.problems.tasks.cnn import SIZES
+from experiments.problems.tasks import cnn
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
+SIZES = cnn.SIZES
 UNITS = (0.4, 1.0, 0.1, 0.1, 0.1)
 """In centimetres, 20 degrees and reflectance."""
 LOWER, UPPER = (-2.0, 11.5, 0.1, 0.1, 0.1), (2.0, 15.5, 0.9, 0.9, 0.9)
@@ -53,7 +53,3 @@ class PoseAndColor(NetworkTask):
     def caption(self, x: Tensor) -> str:
         position, rotation = self.of_scene(x)[:2].tolist()
         return f"{position:.2f} cm, {DEGREES * rotation:.0f}°"
-
-
-def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
-    return PoseAndColor(SIZES[preset], variant, threads)

@@ -18,7 +18,6 @@ from torch.nn import functional
 from experiments.problems.network_task import NetworkTask, Size
 from experiments.problems.scenes.mug import LABEL, LABEL_SIDE, mug_scene
 from experiments.problems.srgb import to_srgb
-from experiments.problems.task import Preset
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TRAINING = ("camera", "chelsea", "brick", "gravel", "coins", "moon", "rocket", "page")
@@ -115,7 +114,3 @@ def _picture(name: str) -> Tensor:
 
     picture = util.img_as_float32(getattr(data, name)())
     return torch.from_numpy(color.rgb2gray(picture[..., :3]) if picture.ndim == 3 else picture).float()
-
-
-def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
-    return Texture(SIZES[preset], variant, threads)

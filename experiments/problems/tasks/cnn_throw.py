@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.scenes.thrown_cube import LOWER, UPPER, ThrownCube
-from experiments.problems.task import Preset
 
 FLOOR = ((0.0, 8.0), (-4.0, 4.0))
 """Range of the picture along x and y [m]."""
@@ -88,7 +87,3 @@ class Throw(NetworkTask):
     def pictures(self, images: Tensor, x: Tensor) -> npt.NDArray[np.uint8]:
         spots = Floor(self.size.film)(images)
         return (255.0 * spots.movedim(1, 3)).round().to(torch.uint8).numpy()
-
-
-def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
-    return Throw(SIZES[preset], variant, threads)

@@ -9,11 +9,10 @@ side.
 """
 
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from experiments.problems.hard_shapes import discs, fitting
-from experiments.problems.task import Preset, Task, uniform
+from experiments.problems.task import Preset, Task, assigned_error, uniform
 
 SOLUTION = (
     *(0.22, 0.25, 0.12, 0.5, 0.2, 0.08, 0.78, 0.24, 0.14),
@@ -34,15 +33,10 @@ def task(preset: Preset = "fast") -> Task:
     def image(x: Tensor) -> Tensor:
         return BRIGHTNESS * discs(x.double())
 
-    def parameter_error(x: Tensor) -> float:
-        distance = (x.view(-1, 1, 3) - places).square().sum(2)
-        found, taken = linear_sum_assignment(distance.numpy())
-        return float(distance[torch.from_numpy(found), torch.from_numpy(taken)].sum()) / len(x)
-
     return fitting(
         image,
         solution,
-        parameter_error,
+        lambda x: assigned_error(x, places),
         name="discs",
         title="places and radii of six interchangeable discs with hard edges",
         parameters="x, y, radius of six discs in units of the image side; centres 0.1 to 0.9, radii 0.04 to 0.2; "

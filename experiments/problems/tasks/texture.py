@@ -16,7 +16,7 @@ import torch
 from skimage import data
 from torch import Tensor
 
-from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
+from experiments.problems.task import Picture, Preset, Task, Truth, differences_from, least_squares, uniform
 
 
 def task(preset: Preset = "fast") -> Task:
@@ -39,9 +39,6 @@ def _texture(name: str, side: int, block: int) -> Task:
     reference = middle.unflatten(0, (side, -1)).unflatten(2, (side, -1)).mean((1, 3))
     target, n = reference.flatten(), side**2
 
-    def residuals(image: Tensor) -> Tensor:
-        return (image - reference).flatten()
-
     def loss(x: Tensor) -> Tensor:
         return (x - target).square().mean(1)
 
@@ -59,7 +56,7 @@ def _texture(name: str, side: int, block: int) -> Task:
         sigma=0.3,
         evaluations=100_000,
         bounds=(torch.zeros(n).double(), torch.ones(n).double()),
-        output=least_squares(lambda x: x.view(-1, side, side), residuals),
+        output=least_squares(lambda x: x.view(-1, side, side), differences_from(reference)),
         truth=Truth(error, error, analytic=lambda x, sigma: loss(x[None])[0] + sigma**2),
         picture=Picture(lambda x: x.view(side, side).clamp(0, 1), lambda: reference),
     )

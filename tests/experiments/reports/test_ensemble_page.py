@@ -62,7 +62,6 @@ def test_the_page_needs_nothing_else(folder):
     assert np.array_equal(np.round(255 * start[..., 0]), pixels)
     for part in ("60 1s 100%", "ValueError: no", "gaussian_process", TASK.title, "not shown: 1"):
         assert part in text
-    assert "Left out" not in text
 
 
 def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):

@@ -63,9 +63,15 @@ def folder(tmp_path):
     return folder
 
 
-def rows(results, name):
+def cells(results, name):
     with (results / f"{name}.csv").open() as file:
         return list(csv.DictReader(file))
+
+
+def rows(results, name):
+    """Cells of a stored table, each row with its origin."""
+    whence = {one.pop("id"): one for one in cells(results, "origins")}
+    return [one | whence[one.pop("origin")] for one in cells(results, name)]
 
 
 def test_a_measure_of_a_task_has_its_median_and_least_value(tmp_path, results):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from black_boxes import counting
 
 from experiments.problems.smooth_losses import functions, lowest
 from experiments.studies import endings as module
@@ -14,12 +15,7 @@ from experiments.studies.endings import CONVEX, HEADERS, METHODS, End, ended, en
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_ends_at_the_minimum(method, box):
     function, start = functions(2, 3)["logistic regression"], torch.tensor([1.5, -0.5], dtype=torch.float64)
-    calls = []
-
-    def counted(z):
-        calls.append(len(z))
-        return function(z)
-
+    counted, calls = counting(function)
     end = ended(method, counted, start, lowest(function, 2), box=box, seed=0)
     assert abs(end.error) < 1e-8
     assert 10 < end.evaluations == sum(calls) - 1  # the last call is for the loss at the start

@@ -26,8 +26,8 @@ def normal(count: int, n: int) -> torch.Tensor:
     return torch.special.ndtri(points)
 
 
-def small_box2(side: int = 16) -> Task:
-    box = box2(side)
+def small_box2() -> Task:
+    box = box2(16)
     return fitting(
         box,
         title="the place of a small square",

@@ -9,13 +9,10 @@ from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
+from truths import normal
 
 n, B, SHAPE = 40, 3, (12, 10)
 SIGMA = torch.linspace(0.1, 0.5, n, dtype=torch.float64)
-
-
-def normal(*shape: int, seed: int) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def image(z: Tensor) -> Tensor:

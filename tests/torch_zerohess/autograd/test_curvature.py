@@ -97,7 +97,7 @@ def test_matrix_free_at_the_size_of_the_cnn(mode):
     from experiments.problems.tasks import cnn
 
     torch.manual_seed(0)
-    encoder = cnn.task().encoder().double()
+    encoder = cnn.Rotation(cnn.SIZES["fast"]).encoder().double()
     parameters = list(encoder.parameters())
     assert sum(p.numel() for p in parameters) == 267_745
     images = torch.rand(2, 3, 64, 64, dtype=torch.float64)

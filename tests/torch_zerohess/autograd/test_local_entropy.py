@@ -12,14 +12,11 @@ from torch import Tensor
 import torch_zerohess as zh
 from torch_zerohess.estimation.coefficients import without_useless_center
 from torch_zerohess.estimation.outer import Entropy
+from truths import squares
 
 
 def identity(z: Tensor) -> Tensor:
     return z.double()
-
-
-def square(outputs: Tensor) -> Tensor:
-    return outputs.square().sum(1)
 
 
 def entropy_of_square(x: Tensor, sigma: float, T: float) -> Tensor:
@@ -42,7 +39,7 @@ def test_value_and_derivatives_of_a_square(memory: bool) -> None:
     box = zh.BlackBox(
         identity,
         zh.Smoothing(sigma=sigma, samples=16384, seed=0, baseline="mean"),
-        head=zh.heads.LocalEntropy(square, temperature),
+        head=zh.heads.LocalEntropy(squares, temperature),
         memory=kept,
         value="smoothed",
     ).eval()
@@ -76,7 +73,7 @@ def test_with_a_memory_it_is_linear_in_what_the_surrogate_leaves(shift: float) -
     box = zh.BlackBox(
         identity,
         zh.Smoothing(sigma=sigma, samples=1 << 14, seed=0),
-        head=zh.heads.LocalEntropy(square, temperature),
+        head=zh.heads.LocalEntropy(squares, temperature),
         memory=memory,
         value="smoothed",
     ).eval()
@@ -89,8 +86,8 @@ def test_with_a_memory_it_is_linear_in_what_the_surrogate_leaves(shift: float) -
 def test_a_high_temperature_is_the_mean() -> None:
     x = torch.tensor([[0.7], [1.5]], dtype=torch.float64, requires_grad=True)
     smoothing = zh.Smoothing(sigma=0.5, samples=64, seed=1)
-    mean = zh.BlackBox(identity, smoothing, head=square)
-    entropy = zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square, 1e6))
+    mean = zh.BlackBox(identity, smoothing, head=squares)
+    entropy = zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(squares, 1e6))
     grads = [torch.autograd.grad(box(x).sum(), x)[0] for box in (mean, entropy)]
     torch.testing.assert_close(*grads, rtol=1e-3, atol=1e-6)
     torch.testing.assert_close(mean(x), entropy(x))
@@ -114,7 +111,7 @@ def test_leads_into_a_valley_that_the_mean_averages_away() -> None:
 
 def test_wrong_arguments_say_so() -> None:
     with pytest.raises(ValueError, match="temperature must be positive"):
-        zh.heads.LocalEntropy(square, 0.0)
+        zh.heads.LocalEntropy(squares, 0.0)
     with pytest.raises(TypeError, match="head must be callable"):
         zh.heads.LocalEntropy(3)
 
@@ -131,13 +128,13 @@ def test_a_class_of_heads_is_no_head() -> None:
 
 def test_tempered_losses_never_overflow() -> None:
     losses, scales = (torch.tensor([row], dtype=torch.float64) for row in ([0.0, 1.0, 1e9], [1e-30, 1.0]))
-    assert bool(torch.isfinite(Entropy(square, 0.1).inner(losses, scales)).all())
+    assert bool(torch.isfinite(Entropy(squares, 0.1).inner(losses, scales)).all())
 
 
 @in_graphs
 def test_a_layer_may_be_compiled_before_its_first_call() -> None:
     smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=1)
-    eager, compiled = (zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square)) for _ in range(2))
+    eager, compiled = (zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(squares)) for _ in range(2))
     x = torch.tensor([[0.7], [1.5]], dtype=torch.float64, requires_grad=True)
     call = torch.compile(compiled, fullgraph=True, backend="aot_eager")
     slopes = [torch.autograd.grad(box(x).sum(), x)[0] for box in (call, eager)]
@@ -145,7 +142,7 @@ def test_a_layer_may_be_compiled_before_its_first_call() -> None:
 
 
 def test_a_local_entropy_inside_of_another_function_is_refused() -> None:
-    inner = zh.heads.LocalEntropy(square)
+    inner = zh.heads.LocalEntropy(squares)
     x = torch.ones(2, 1, requires_grad=True)
     for head in (lambda y: inner(y), functools.partial(inner)):
         layer = zh.BlackBox(identity, zh.Smoothing(sigma=0.5, samples=8), head=head)
@@ -161,7 +158,7 @@ def test_near_a_minimum_the_center_is_no_baseline() -> None:
     x[:, 0] = at
     x.requires_grad_()
     smoothing = zh.Smoothing(sigma=sigma, samples=16, seed=0)
-    layer = zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square, temperature), value="smoothed")
+    layer = zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(squares, temperature), value="smoothed")
     F = layer(x)
     (g,) = torch.autograd.grad(F.sum(), x, create_graph=True)
     (h,) = torch.autograd.grad(g[:, 0].sum(), x)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from black_boxes import counting
 from layers import Fixed
 from torch import Tensor, nn
 
@@ -245,12 +246,7 @@ def test_roundings_and_integers_of_a_surrogate_are_no_draws(returned: Callable[[
 
 
 def test_a_surrogate_is_called_twice_at_few_points_after_a_fit_alone() -> None:
-    counts = []
-
-    def counted(z: Tensor) -> Tensor:
-        counts.append(len(z))
-        return render(z)
-
+    counted, counts = counting(render)
     memory, (x, r) = remembering(Fixed(counted), draws=64), point()
     called = layer(memory).eval()
     called(x, r)

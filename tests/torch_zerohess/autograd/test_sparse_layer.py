@@ -6,11 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from layers import counting
 from torch import nn
 
 import torch_zerohess as zh
 from torch_zerohess.autograd import sparse_layer
 from torch_zerohess.evaluators.inline import Inline
+from truths import normal
 
 SIDE, N = 12, 144
 SMOOTHING = zh.Smoothing(sigma=0.1, samples=64, seed=0)
@@ -21,11 +23,7 @@ def blurred(z):
     return nn.functional.avg_pool2d(z.tanh().view(-1, SIDE, SIDE), 3, 1)
 
 
-def drawn(*shape, seed=0):
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-X, TARGET = drawn(3, N), drawn(3, 10, 10, seed=1)
+X, TARGET = normal(3, N), normal(3, 10, 10, seed=1)
 
 
 def exact(x):
@@ -46,7 +44,7 @@ def relative(one, other):
 
 def test_gradient_and_gauss_newton_product():
     """The noise of the dense layer, with as many evaluations, is a hundred times as large."""
-    v, jacobian = drawn(3, N, seed=2), exact(X)
+    v, jacobian = normal(3, N, seed=2), exact(X)
     slope = torch.einsum("bmn,bm->bn", jacobian, (blurred(X) - TARGET).flatten(1))
     product = torch.einsum("bmn,bm->bn", jacobian, torch.einsum("bmn,bn->bm", jacobian, v))
     found = gradient_and_product(zh.SparseBlackBox(blurred, SMOOTHING), v)
@@ -71,14 +69,14 @@ def test_points_one_at_a_time_where_the_evaluator_says():
 
     whole, evaluator = zh.SparseBlackBox(blurred, SMOOTHING), Counting()
     single = zh.SparseBlackBox(one, SMOOTHING, vectorized=False, evaluator=evaluator)
-    v = drawn(3, N, seed=2)
+    v = normal(3, N, seed=2)
     for found, expected in zip(*(gradient_and_product(layer, v) for layer in (single, whole)), strict=True):
         torch.testing.assert_close(found, expected)
     assert evaluator.calls == 4  # the values, and the samples around each of three points
 
 
 def test_samples_without_a_value():
-    v = drawn(3, N, seed=2)
+    v = normal(3, N, seed=2)
 
     def holes(z):
         outputs = blurred(z).clone()
@@ -96,7 +94,7 @@ def test_samples_without_a_value():
 
 def test_second_derivatives_of_first_ones_in_a_batch():
     """`is_grads_batched` maps in an older way than `torch.func`, which takes the graph from functions."""
-    layer, x, v = zh.SparseBlackBox(blurred, SMOOTHING), X.clone().requires_grad_(), drawn(2, 3, 10, 10, seed=2)
+    layer, x, v = zh.SparseBlackBox(blurred, SMOOTHING), X.clone().requires_grad_(), normal(2, 3, 10, 10, seed=2)
     y = layer(x.sin()).exp()
     each = [torch.autograd.grad(y, x, one, create_graph=True)[0] for one in v]
     (rows,) = torch.autograd.grad(y, x, v, create_graph=True, is_grads_batched=True)
@@ -108,7 +106,7 @@ def test_second_derivatives_of_first_ones_in_a_batch():
 
 
 def test_the_layer_is_linear_around_the_point_of_the_call():
-    layer, v = zh.SparseBlackBox(blurred, SMOOTHING), drawn(3, N, seed=2)
+    layer, v = zh.SparseBlackBox(blurred, SMOOTHING), normal(3, N, seed=2)
     slope, product = gradient_and_product(layer, v)
     jacobian = torch.stack([one.dense() for one in layer.jacobians]).flatten(1, 2)
     residual = (blurred(X) - TARGET).flatten(1)
@@ -120,7 +118,7 @@ def test_the_layer_is_linear_around_the_point_of_the_call():
 def test_a_network_learns_through_it():
     """Newton steps with few samples: the support is kept from call to call."""
     torch.manual_seed(0)
-    network, inputs = nn.Linear(5, N).double(), drawn(4, 5)
+    network, inputs = nn.Linear(5, N).double(), normal(4, 5)
     wanted = blurred(nn.Linear(5, N).double()(inputs)).detach()
     layer = zh.SparseBlackBox(blurred, zh.Smoothing(sigma=0.1, samples=30, seed=0), grid=(SIDE, SIDE))
     settings = {"solver": "dual", "modification": "abs", "damping": 1e-3, "adapt": False}
@@ -130,12 +128,7 @@ def test_a_network_learns_through_it():
 
 
 def test_evaluations_and_what_is_evaluated_without_derivatives():
-    calls = []
-
-    def counted(z):
-        calls.append(len(z))
-        return blurred(z)
-
+    counted, calls = counting(blurred)
     layer = zh.SparseBlackBox(counted, SMOOTHING)
     layer(X.clone().requires_grad_())
     assert calls == [3, 128, 128, 128]
@@ -149,7 +142,7 @@ def test_evaluations_and_what_is_evaluated_without_derivatives():
 @pytest.mark.parametrize("batch", [(), (2,), (2, 1)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_shapes_and_types(batch, dtype):
-    x = drawn(*batch, N).to(dtype).requires_grad_()
+    x = normal(*batch, N).to(dtype).requires_grad_()
     y = zh.SparseBlackBox(blurred, SMOOTHING)(x)
     assert y.shape == (*batch, 10, 10)
     assert y.dtype == dtype
@@ -162,7 +155,7 @@ def test_an_empty_batch_after_another_one():
     layer, x = zh.SparseBlackBox(blurred, SMOOTHING), torch.zeros(0, N, requires_grad=True)
     with pytest.raises(ValueError, match="every batch dimension > 0"):
         layer(x)
-    layer(drawn(1, N).requires_grad_())
+    layer(normal(1, N).requires_grad_())
     y = layer(x)
     y.sum().backward()
     assert (y.shape, x.grad.shape) == ((0, 10, 10), (0, N))
@@ -171,7 +164,7 @@ def test_an_empty_batch_after_another_one():
 def test_another_shape_of_the_output_starts_afresh():
     shown = {"rows": 10}
     layer = zh.SparseBlackBox(lambda z: blurred(z)[:, : shown["rows"]], SMOOTHING)
-    x = drawn(1, N).requires_grad_()
+    x = normal(1, N).requires_grad_()
     layer(x).sum().backward()
     shown["rows"] = 6
     fresh = zh.SparseBlackBox(layer.call.fn, SMOOTHING)
@@ -201,7 +194,7 @@ def test_with_a_fixed_seed_errors_are_of_samples_that_earlier_calls_have_not_see
     Of 220 to 250 slopes 93 to 99 % are within 1.96 standard errors. If samples are drawn again, 85 % are, and errors
     stay the same.
     """
-    A = drawn(80, 200) * (drawn(80, 200, seed=1).abs().argsort(1).argsort(1) < 4)
+    A = normal(80, 200) * (normal(80, 200, seed=1).abs().argsort(1).argsort(1) < 4)
 
     def rough(z):
         return z @ A.mT + 0.1 * torch.sin(1e5 * (z @ A.mT))
@@ -209,7 +202,7 @@ def test_with_a_fixed_seed_errors_are_of_samples_that_earlier_calls_have_not_see
     def change(u):
         return 0.5 * (rough(u) - rough(-u))
 
-    u, x = 0.1 * drawn(2000, 200, seed=2), torch.zeros(1, 200, dtype=torch.float64, requires_grad=True)
+    u, x = 0.1 * normal(2000, 200, seed=2), torch.zeros(1, 200, dtype=torch.float64, requires_grad=True)
     layer = zh.SparseBlackBox(rough, zh.Smoothing(sigma=0.1, samples=60, seed=0))
     errors = []
     for _ in range(4):

@@ -13,21 +13,17 @@ from torch import Tensor
 from torch_zerohess import BlackBox, Smoothing, estimate, sparse_jacobian
 from torch_zerohess.estimation.coefficients import mean_of_others
 from torch_zerohess.evaluators.values import as_tensor, checked_values
-from truths import spread, vector
+from truths import spread, squares, vector
 
 S = Smoothing(sigma=0.5, samples=8, proposal="gaussian", seed=1)
 X = vector(0.1, 0.2)
 
 
-def f(z: Tensor) -> Tensor:
-    return z.square().sum(1)
-
-
 def holes(*rows: int):
-    """f, but nan at some of the points of a call."""
+    """Squares, but nan at some of the points of a call."""
 
     def fn(z: Tensor) -> Tensor:
-        values = f(z)
+        values = squares(z)
         values[list(rows)] = math.nan
         return values
 
@@ -48,7 +44,7 @@ def test_the_other_one_of_a_dropped_pair_goes_with_it() -> None:
     assert got.dropped == 4  # rows 2, 10 and 3, 11
     kept = [k for k in range(16) if k % 8 not in (2, 3)]
     u = (got.points[:-1] - X) / 0.5
-    by_hand = ((f(got.points[:-1]) - f(X[None]))[:, None] * u)[kept].mean(0) / 0.5
+    by_hand = ((squares(got.points[:-1]) - squares(X[None]))[:, None] * u)[kept].mean(0) / 0.5
     torch.testing.assert_close(got.gradient, by_hand)
     single = estimate(holes(2), X, S.replace(antithetic=False), on_nonfinite="drop")
     assert single.dropped == 1
@@ -75,12 +71,12 @@ def test_an_element_in_a_region_without_values_is_noticed_in_a_batch() -> None:
     generator, left = torch.Generator().manual_seed(0), []
 
     def fails_above_one(z: Tensor) -> Tensor:
-        return torch.where(z[:, 0] > 1.0, math.nan, f(z))
+        return torch.where(z[:, 0] > 1.0, math.nan, squares(z))
 
     def fails_at_random(z: Tensor) -> Tensor:
         lost = torch.rand(len(z), generator=generator) < 0.4
         left.append(float((~lost).reshape(40, 32).double().mean(1).min()))
-        return torch.where(lost, math.nan, f(z))
+        return torch.where(lost, math.nan, squares(z))
 
     single = S.replace(samples=32, antithetic=False, baseline="mean")
     with pytest.warns(UserWarning, match="drops most draws around a point"):
@@ -147,7 +143,7 @@ def test_the_function_cannot_change_auxiliary_inputs() -> None:
     a = torch.ones(2)
 
     def greedy(z: Tensor, one: Tensor) -> Tensor:
-        result = f(z) * one.sum(1)
+        result = squares(z) * one.sum(1)
         one.zero_()
         return result
 
@@ -298,9 +294,9 @@ def test_several_results_of_a_batch_are_refused(second: Any, count: int) -> None
     """As many results as points, too; a function of one point may return a tuple, and one of a batch a list."""
     z = torch.rand(count, 2, dtype=torch.float64)
     with pytest.raises(TypeError, match=r"^fn must return one tensor \[K, \*out\], got a tuple of 2: return one"):
-        checked_values((f(z), second), z)
-    assert checked_values([f(one[None]) for one in z], z).shape == (count, 1)
-    assert checked_values(tuple(f(one[None])[0] for one in z), z).shape == (count,)
+        checked_values((squares(z), second), z)
+    assert checked_values([squares(one[None]) for one in z], z).shape == (count, 1)
+    assert checked_values(tuple(squares(one[None])[0] for one in z), z).shape == (count,)
     got = estimate(lambda one: (one.sum()[None], one[:1].square()), X, S, vectorized=False).value
     torch.testing.assert_close(got, torch.stack([X.sum()[None], X[:1].square()]))
 
@@ -326,11 +322,11 @@ def test_the_number_in_place_of_nan_is_kept_in_float64(
 ) -> None:
     """The number has no finite, or no equal, counterpart in the type that fn returns."""
     x = X.to(x_dtype)
-    bad = estimate(f, x, S).points[[2, 11]]
+    bad = estimate(squares, x, S).points[[2, 11]]
 
     def fn(z: Tensor) -> Tensor:
         hole = (z[:, None] == bad).all(2).any(1)
-        return torch.where(hole, math.nan, f(z)).to(returned)
+        return torch.where(hole, math.nan, squares(z)).to(returned)
 
     def filled(z: Tensor) -> Tensor:
         return torch.nan_to_num(fn(z).double(), nan=number)

@@ -16,15 +16,11 @@ from torch_zerohess.adapters.mitsuba import MitsubaScene
 from torch_zerohess.adapters.onnx import OnnxFunction
 from torch_zerohess.adapters.process import Program
 from torch_zerohess.evaluators import Factory
-from truths import spread, vector
+from truths import spread, squares, vector
 
 S = Smoothing(sigma=0.5, samples=3, seed=1)
 ONE = S.replace(samples=1)
 X = vector(0.1, 0.2)
-
-
-def f(z: Tensor) -> Tensor:
-    return z.square().sum(1)
 
 
 SETTINGS = [
@@ -132,8 +128,13 @@ POINTS = [
 
 @pytest.mark.parametrize(("x", "error", "message"), POINTS)
 def test_points(x: object, error: type[Exception], message: str) -> None:
-    layer = BlackBox(f, S)
-    for call in (lambda: estimate(f, x, S), lambda: layer(x), lambda: layer.freeze(x), lambda: smooth(f, S)(x)):
+    layer = BlackBox(squares, S)
+    for call in (
+        lambda: estimate(squares, x, S),
+        lambda: layer(x),
+        lambda: layer.freeze(x),
+        lambda: smooth(squares, S)(x),
+    ):
         with pytest.raises(error, match=message):
             call()
 
@@ -141,16 +142,20 @@ def test_points(x: object, error: type[Exception], message: str) -> None:
 FUNCTIONS = [
     (lambda z: z.sum(), ValueError, r"fn must return one value per point, \[K, \*out\].*got \[\].*vectorized=False"),
     (lambda z: z.sum(0), ValueError, r"fn must return one value per point, \[K, \*out\].*got \[2\]"),
-    (lambda z: f(z)[:-1], ValueError, r"\[K, \*out\] for points \[K, 2\], got \[[06]\]"),
-    (lambda z: f(z) * 1j, TypeError, r"fn must return real numbers, got torch\.complex128"),
-    (lambda z: (f(z) * 1j).numpy(), TypeError, r"fn must return real numbers, got torch\.complex128"),
+    (lambda z: squares(z)[:-1], ValueError, r"\[K, \*out\] for points \[K, 2\], got \[[06]\]"),
+    (lambda z: squares(z) * 1j, TypeError, r"fn must return real numbers, got torch\.complex128"),
+    (lambda z: (squares(z) * 1j).numpy(), TypeError, r"fn must return real numbers, got torch\.complex128"),
     (lambda z: None, TypeError, "fn must return a tensor or a NumPy array of numbers, got NoneType"),
     (lambda z: "f", TypeError, "fn must return a tensor or a NumPy array of numbers, got str"),
-    (lambda z: {"loss": f(z)}, TypeError, "fn must return a tensor or a NumPy array of numbers, got dict"),
-    (lambda z: f(z).requires_grad_(), ValueError, r"fn returned a tensor that requires grad.*detached"),
-    (lambda z: f(z) + math.nan, ValueError, r"fn returned nan at the point \[0?.*on_nonfinite='drop' or a number"),
-    (lambda z: f(z) / 0.0, ValueError, r"fn returned inf at the point \["),
-    (lambda z: f(z)[:, None] * vector(1.0, -math.inf), ValueError, r"fn returned -inf at the point \["),
+    (lambda z: {"loss": squares(z)}, TypeError, "fn must return a tensor or a NumPy array of numbers, got dict"),
+    (lambda z: squares(z).requires_grad_(), ValueError, r"fn returned a tensor that requires grad.*detached"),
+    (
+        lambda z: squares(z) + math.nan,
+        ValueError,
+        r"fn returned nan at the point \[0?.*on_nonfinite='drop' or a number",
+    ),
+    (lambda z: squares(z) / 0.0, ValueError, r"fn returned inf at the point \["),
+    (lambda z: squares(z)[:, None] * vector(1.0, -math.inf), ValueError, r"fn returned -inf at the point \["),
 ]
 
 
@@ -242,9 +247,9 @@ class Batches:
     ("fn", "aux", "notes"),
     [
         (lambda z: torch.autograd.grad(z.square().sum(), z)[0], [], ["fn is called under torch.no_grad(): compute"]),
-        (lambda z: f(z), [torch.ones(3)], [f"{CALLED}, aux [7, 3])"]),
-        (lambda z, y, w: f(z), [torch.ones(3)], [f"{CALLED}, aux [7, 3])"]),
-        (lambda z, y: f(z), [], [f"{CALLED})"]),
+        (lambda z: squares(z), [torch.ones(3)], [f"{CALLED}, aux [7, 3])"]),
+        (lambda z, y, w: squares(z), [torch.ones(3)], [f"{CALLED}, aux [7, 3])"]),
+        (lambda z, y: squares(z), [], [f"{CALLED})"]),
         (lambda z: (lambda a, b: a)(*z), [], [f"{CALLED}); if it takes one point, pass vectorized=False"]),
         (Batches(), [], []),
         (Batches(TypeError).__call__, [], []),
@@ -272,7 +277,7 @@ def test_an_error_of_a_later_batch_has_no_note() -> None:
         calls.append(z)
         if len(calls) == 2:
             raise ValueError("lost the scene")
-        return f(z)
+        return squares(z)
 
     layer = BlackBox(fn, S)
     layer(X)
@@ -285,57 +290,57 @@ def test_the_function_cannot_change_its_input() -> None:
     x = X.clone()
 
     def greedy(z: Tensor) -> Tensor:
-        result = f(z)
+        result = squares(z)
         z.zero_()
         return result
 
     with torch.no_grad():
         BlackBox(greedy, S)(x)
-    got, expected = estimate(greedy, x, S.replace(baseline="none"), value="smoothed"), estimate(f, X, S)
+    got, expected = estimate(greedy, x, S.replace(baseline="none"), value="smoothed"), estimate(squares, X, S)
     assert torch.equal(x, X)
     assert torch.equal(got.points, expected.points[:-1])
 
 
 OTHERS = [
-    (lambda: estimate(f, X, S.replace(sigma=torch.ones(3))), ValueError, "sigma has 3 elements, but x has 2"),
-    (lambda: estimate(f, X, S.replace(sigma=torch.ones(1))), ValueError, "sigma has 1 elements, but x has 2"),
-    (lambda: BlackBox(f, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
-    (lambda: estimate(f, X, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
+    (lambda: estimate(squares, X, S.replace(sigma=torch.ones(3))), ValueError, "sigma has 3 elements, but x has 2"),
+    (lambda: estimate(squares, X, S.replace(sigma=torch.ones(1))), ValueError, "sigma has 1 elements, but x has 2"),
+    (lambda: BlackBox(squares, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
+    (lambda: estimate(squares, X, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
     (lambda: BlackBox("f", S), TypeError, "fn must be callable, got 'f'"),
     (lambda: estimate(None, X, S), TypeError, "fn must be callable, got None"),
-    (lambda: BlackBox(f, S, value="mean"), ValueError, "value must be 'center' or 'smoothed', got 'mean'"),
+    (lambda: BlackBox(squares, S, value="mean"), ValueError, "value must be 'center' or 'smoothed', got 'mean'"),
     (
-        lambda: BlackBox(f, S, on_nonfinite="skip"),
+        lambda: BlackBox(squares, S, on_nonfinite="skip"),
         ValueError,
         "on_nonfinite must be 'raise', 'drop' or a finite number, got",
     ),
-    (lambda: BlackBox(f, S, on_nonfinite=True), TypeError, "on_nonfinite must be .*got True"),
-    (lambda: BlackBox(f, S, on_nonfinite=None), TypeError, "'raise', 'drop' or a finite number, got None"),
-    (lambda: BlackBox(f, S, on_nonfinite=math.inf), ValueError, "'raise', 'drop' or a finite number, got inf"),
-    (lambda: estimate(f, X, S, 1.0), TypeError, r"aux\[0\] must be a tensor \[\*batch, \.\.\.\], got float"),
+    (lambda: BlackBox(squares, S, on_nonfinite=True), TypeError, "on_nonfinite must be .*got True"),
+    (lambda: BlackBox(squares, S, on_nonfinite=None), TypeError, "'raise', 'drop' or a finite number, got None"),
+    (lambda: BlackBox(squares, S, on_nonfinite=math.inf), ValueError, "'raise', 'drop' or a finite number, got inf"),
+    (lambda: estimate(squares, X, S, 1.0), TypeError, r"aux\[0\] must be a tensor \[\*batch, \.\.\.\], got float"),
     (
-        lambda: estimate(lambda z, a: f(z), X.expand(3, 2), S, torch.ones(2)),
+        lambda: estimate(lambda z, a: squares(z), X.expand(3, 2), S, torch.ones(2)),
         ValueError,
         r"aux\[0\] must have the batch dimensions \[3\] of x first, got \[2\]",
     ),
-    (lambda: estimate(f, X, S).hvp(torch.ones(3)), ValueError, r"v must be a tensor of shape \[2\], got \[3\]"),
-    (lambda: estimate(f, X, S).hvp([1.0, 2.0]), ValueError, r"v must be a tensor of shape \[2\], got list"),
-    (lambda: estimate(f, X, S).standard_error("slope"), ValueError, "quantity must be 'value', .*got 'slope'"),
-    (lambda: estimate(f, X, S).standard_error("hvp"), ValueError, "v is the vector of quantity 'hvp'"),
-    (lambda: estimate(f, X, S).standard_error("value", X), ValueError, "v is the vector of quantity 'hvp'"),
-    (lambda: estimate(f, X, ONE).standard_error("value"), ValueError, "at least two independent draws"),
+    (lambda: estimate(squares, X, S).hvp(torch.ones(3)), ValueError, r"v must be a tensor of shape \[2\], got \[3\]"),
+    (lambda: estimate(squares, X, S).hvp([1.0, 2.0]), ValueError, r"v must be a tensor of shape \[2\], got list"),
+    (lambda: estimate(squares, X, S).standard_error("slope"), ValueError, "quantity must be 'value', .*got 'slope'"),
+    (lambda: estimate(squares, X, S).standard_error("hvp"), ValueError, "v is the vector of quantity 'hvp'"),
+    (lambda: estimate(squares, X, S).standard_error("value", X), ValueError, "v is the vector of quantity 'hvp'"),
+    (lambda: estimate(squares, X, ONE).standard_error("value"), ValueError, "at least two independent draws"),
     (
-        lambda: estimate(f, X, ONE.replace(proposal="optimal")).standard_error("value"),
+        lambda: estimate(squares, X, ONE.replace(proposal="optimal")).standard_error("value"),
         ValueError,
         "at least 2 samples per element, got 1",
     ),
     (
-        lambda: estimate(lambda z: f(z) * torch.where(z[:, 0] == X[0], 1.0, math.nan), X, S, on_nonfinite="drop"),
+        lambda: estimate(lambda z: squares(z) * torch.where(z[:, 0] == X[0], 1.0, math.nan), X, S, on_nonfinite="drop"),
         ValueError,
         "on_nonfinite='drop' left 0 of 3 draws, 1 are needed",
     ),
     (
-        lambda: estimate(f, torch.zeros(30_000), S.replace(sampler="sobol")),
+        lambda: estimate(squares, torch.zeros(30_000), S.replace(sampler="sobol")),
         ValueError,
         "sampler 'sobol' has .* dimensions at most, but x has 30000 parameters: use 'random'",
     ),
@@ -344,7 +349,7 @@ OTHERS = [
 
 @pytest.mark.parametrize("value", ["center", "smoothed"])
 def test_a_sigma_of_another_length_is_refused_without_gradients_too(value: str) -> None:
-    layer = BlackBox(f, S.replace(sigma=torch.ones(3)), value=value)
+    layer = BlackBox(squares, S.replace(sigma=torch.ones(3)), value=value)
     for x in (X, X.clone().requires_grad_()):
         with pytest.raises(ValueError, match="sigma has 3 elements, but x has 2 parameters"):
             layer(x)
@@ -361,10 +366,10 @@ def test_other_arguments(call, error: type[Exception], message: str) -> None:
 def test_optimal_sampling_stops_at_a_million_evaluations() -> None:
     """1 + n + n (n + 1) / 2 = 6 sets of pairs for two parameters."""
     most = S.replace(proposal="optimal", samples=83_333)
-    assert estimate(f, X, most).evaluations == 999_996 + 1
+    assert estimate(squares, X, most).evaluations == 999_996 + 1
     message = "would need 1000008 evaluations for 1 x 2 .* at most 1000000 .* use proposal 'aggregate'"
     with pytest.raises(ValueError, match=message):
-        estimate(f, X, most.replace(samples=83_334))
+        estimate(squares, X, most.replace(samples=83_334))
     assert most.replace(samples=3).evaluations(1000, center=False) == 3_009_006
 
 
@@ -374,7 +379,7 @@ FIRST_ORDER = "first derivatives only .*use Smoothing\\(proposal='aggregate', or
 @pytest.mark.parametrize("changes", [{"proposal": "fr22"}, {"proposal": "optimal", "order": 1}])
 def test_first_order_samples_have_no_hessian(changes: dict) -> None:
     smoothing = S.replace(**changes)
-    e, layer, x = estimate(f, X, smoothing), smooth(f, smoothing), X.clone().requires_grad_()
+    e, layer, x = estimate(squares, X, smoothing), smooth(squares, smoothing), X.clone().requires_grad_()
 
     def double_backward() -> None:
         (gradient,) = torch.autograd.grad(layer(x), x, create_graph=True)
@@ -405,14 +410,17 @@ def test_sigma_below_the_rounding_of_x(dtype: torch.dtype, sigma: float, hint: s
     """Numbers of float32 near 100 are 2^-17 apart. With a third of that, the gradient would be a fifth too small."""
     x = torch.tensor([0.0, 100.0], dtype=dtype)
     message = rf"sigma is below the rounding of x: x \+ sigma\*u == x .*parameter 1, x = 100\.0, sigma = .*{hint}"
-    for call in (lambda: estimate(f, x, S.replace(sigma=sigma)), lambda: BlackBox(f, S.replace(sigma=sigma)).freeze(x)):
+    for call in (
+        lambda: estimate(squares, x, S.replace(sigma=sigma)),
+        lambda: BlackBox(squares, S.replace(sigma=sigma)).freeze(x),
+    ):
         with pytest.raises(ValueError, match=message):
             call()
 
 
 def test_sigma_below_the_smallest_number() -> None:
     with pytest.raises(ValueError, match=r"sigma is below the rounding of x: .* x = 0\.0, sigma = 1e-46"):
-        estimate(f, torch.zeros(2), S.replace(sigma=1e-46))
+        estimate(squares, torch.zeros(2), S.replace(sigma=1e-46))
 
 
 @settings(deadline=None, derandomize=True, max_examples=150)
@@ -488,7 +496,7 @@ def test_an_x_that_is_not_finite_is_named_before_fn_is_called() -> None:
 
 def test_a_sparse_x_is_refused() -> None:
     with pytest.raises(TypeError, match=r"x must be dense, got torch\.sparse_coo: convert by x\.to_dense\(\)"):
-        estimate(f, torch.ones(2).to_sparse(), S)
+        estimate(squares, torch.ones(2).to_sparse(), S)
 
 
 @pytest.mark.parametrize("layout", [torch.strided, torch.jagged])
@@ -496,14 +504,14 @@ def test_a_sparse_x_is_refused() -> None:
 def test_nested_tensors_are_refused_by_name(layout: torch.layout) -> None:
     nested = torch.nested.nested_tensor([torch.ones(2, 3), torch.ones(1, 3)], layout=layout)
     with pytest.raises(TypeError, match="x must be one dense tensor, got a nested tensor: pass its parts one by one"):
-        estimate(f, nested, S)
+        estimate(squares, nested, S)
     with pytest.raises(TypeError, match=r"aux\[0\] must be one dense tensor, got a nested tensor"):
-        BlackBox(lambda z, _: f(z), S)(torch.ones(2, 3), nested)
+        BlackBox(lambda z, _: squares(z), S)(torch.ones(2, 3), nested)
 
 
 def test_a_symbolic_trace_says_what_to_do() -> None:
     with pytest.raises(TypeError, match=r"got Proxy: torch\.fx cannot trace a black box, make its layer a leaf module"):
-        torch.fx.symbolic_trace(BlackBox(f, S))
+        torch.fx.symbolic_trace(BlackBox(squares, S))
 
 
 def test_an_executor_is_no_evaluator() -> None:
@@ -511,4 +519,4 @@ def test_an_executor_is_no_evaluator() -> None:
         concurrent.futures.ThreadPoolExecutor(1) as threads,
         pytest.raises(TypeError, match=r"evaluator must be callable: write torch_zerohess\.evaluators\.Executor"),
     ):
-        estimate(f, X, S, evaluator=threads)
+        estimate(squares, X, S, evaluator=threads)

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from black_boxes import counting
 from scipy import stats
 from torch import Tensor
 
@@ -313,12 +314,7 @@ SLOPE = Exponential(vector(0.9, -1.3))
 )
 def test_drawing_up_to_a_tolerance(proposal: str, sampler: str) -> None:
     smoothing = Smoothing(sigma=SIGMA, samples=8, proposal=proposal, sampler=sampler, seed=4)
-    calls = []
-
-    def fn(z: Tensor) -> Tensor:
-        calls.append(len(z))
-        return SLOPE(z)
-
+    fn, calls = counting(SLOPE)
     got = estimate(fn, X, smoothing, tolerance=0.02, max_evaluations=50_000)
     assert got.reason.startswith("tolerance: the relative error of the gradient is 0.0")
     assert sum(calls) == got.evaluations == len(got.points) == len(got.values) <= 50_000

@@ -16,11 +16,11 @@ def matrices(values):
     return bases * values @ bases.mT
 
 
-def steps(h, g, *, factor=None, iterations=N, tolerance=1e-12):
+def steps(h, g, *, factor=None, iterations=N):
     factor = torch.eye(N, dtype=torch.float64) if factor is None else factor
     shift = torch.full((B, 1), SHIFT, dtype=torch.float64)
     return saddle_free_steps(
-        lambda v: (h @ v[..., None])[..., 0], g, shift, factor, iterations=iterations, tolerance=tolerance
+        lambda v: (h @ v[..., None])[..., 0], g, shift, factor, iterations=iterations, tolerance=1e-12
     )
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 from torch_zerohess.linalg import smoothed_newton
 from torch_zerohess.linalg.krylov import krylov_steps
 from torch_zerohess.linalg.smoothed_newton import LinearOutputs, smoothed_minimum
-from truths import normal, vector
+from truths import magnitudes, normal, vector
 
 M, N = 60, 30
 A, Y = normal(M, N), normal(M, seed=1)
@@ -33,10 +33,6 @@ def minimum(loss, radius=100.0, bound=math.inf, matrix=A, y=Y, calls=None):
     widths = matrix.square().sum(1).sqrt() * radius / matrix.shape[1] ** 0.5
     start = torch.zeros_like(every)
     return smoothed_minimum(outputs(loss, matrix, y, calls), widths, radius, -every, every, start)
-
-
-def magnitudes(y):
-    return y.abs().sum()
 
 
 def least_magnitudes(bound):

@@ -18,7 +18,7 @@ def rotation(n, generator):
     return q
 
 
-def check_optimality(g, H, radius, tolerance=1e-8):
+def check_optimality(g, H, radius):
     """Exists mu >= 0 with (H + mu) s = -g, H + mu >= 0, |s| <= radius, mu (radius - |s|) = 0 (Moré and Sorensen).
 
     These are necessary and sufficient. Every error is relative to the largest term that could be there.
@@ -33,9 +33,9 @@ def check_optimality(g, H, radius, tolerance=1e-8):
     assert length <= 1 + 1e-12
     force = B @ t + G
     mu = max(0.0, -float(t @ force) / length**2) if length > 1e-140 else 0.0
-    assert float((force + mu * t).norm()) <= tolerance
-    assert float(curvature[0]) / scale + mu >= -tolerance
-    assert mu * (1 - length) <= tolerance
+    assert float((force + mu * t).norm()) <= 1e-8
+    assert float(curvature[0]) / scale + mu >= -1e-8
+    assert mu * (1 - length) <= 1e-8
     return s
 
 

@@ -4,17 +4,13 @@ import statistics
 
 import pytest
 import torch
+from searches import noisy
 
 import torch_zerohess as zh
 from torch_zerohess.minimization import record as record_module
 from torch_zerohess.minimization.record import Record
 from torch_zerohess.minimization.regression import LossRegression, modelled_minimum, regression
 from truths import vector
-
-
-def noisy(fn, noise, seed):
-    generator = torch.Generator().manual_seed(seed)
-    return lambda z: fn(z) + noise * torch.randn(len(z), generator=generator, dtype=torch.float64)
 
 
 def quadratic(z):

@@ -12,14 +12,10 @@ from torch_zerohess.evaluators import Executor, Inline, ProcessPool
 from torch_zerohess.evaluators.batch import MOST, cut
 from torch_zerohess.minimization.noise import is_rounding
 from torch_zerohess.minimization.separate import lengths, separated
-from truths import vector
+from truths import squares, vector
 
 NOISE = 0.3
 SETTINGS = {"sigma": 1.0, "max_evaluations": 150}
-
-
-def squares(z: Tensor) -> Tensor:
-    return z.square().sum(1)
 
 
 def shifted(y: Tensor) -> Tensor:

@@ -160,9 +160,9 @@ def test_state_dict_resumes_to_the_bit(make, other, dtype, tmp_path):
         assert torch.equal(one.detach(), expected.detach())
 
 
-def noisy_bowl(x, scales, generator, R=8, noise=0.1):
-    """R losses whose mean is sum(scales x^2)/2, but for errors of their gradients."""
-    slopes = noise * torch.randn(R, len(x), dtype=x.dtype, generator=generator)
+def noisy_bowl(x, scales, generator):
+    """Eight losses whose mean is sum(scales x^2)/2, but for errors of their gradients."""
+    slopes = 0.1 * torch.randn(8, len(x), dtype=x.dtype, generator=generator)
     return 0.5 * (scales * x**2).sum() + slopes @ x
 
 

@@ -8,9 +8,9 @@ import torch_zerohess as zh
 from torch_zerohess.optim.newton_targets import NewtonTargets
 
 
-def quadratics(n, seed=0):
+def quadratics(n):
     """Matrices [3, n, n] of condition 1e4, minima [3, n], and the losses of rows."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     bases = torch.linalg.qr(torch.randn(3, n, n, generator=generator, dtype=torch.float64))[0]
     matrices = bases * torch.logspace(0, 4, n, dtype=torch.float64) @ bases.mT
     minima = torch.randn(3, n, generator=generator, dtype=torch.float64)

@@ -10,7 +10,7 @@ import torch
 
 from torch_zerohess.sampling import extension, kernels, philox, proposals
 from torch_zerohess.sampling.kernels import Redrawn
-from truths import spread
+from truths import doubles, spread
 
 SIZES = [1, 2, 3, 7, 8, 9, 255, 256, 257, 300, 1024]
 DENSITIES = [
@@ -326,12 +326,8 @@ def test_noncontiguous_inputs() -> None:
         ops.project(v, t)
 
 
-def doubles(*shape: int) -> torch.Tensor:
-    return torch.zeros(shape, dtype=torch.float64)
-
-
-def recipe(rows: int = 4, B: int = 2, n: int = 3, sigma: int = 3, columns: int = 5) -> tuple:
-    return torch.zeros(rows, columns, dtype=torch.int64), doubles(B, n), doubles(sigma), True, False
+def recipe(rows: int = 4, sigma: int = 3, columns: int = 5) -> tuple:
+    return torch.zeros(rows, columns, dtype=torch.int64), doubles(2, 3), doubles(sigma), True, False
 
 
 COUNTS = torch.arange(4)

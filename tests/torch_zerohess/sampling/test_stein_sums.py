@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.sampling import extension, kernels, proposals, stein_sums
-from truths import spread
+from truths import doubles, spread
 
 ops = torch.ops.torch_zerohess
 EPS = torch.finfo(torch.float64).eps
@@ -153,10 +153,6 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
             assert all(torch.equal(p, q) for p, q in zip(one, everything(), strict=True)), threads
     finally:
         torch.set_num_threads(before)
-
-
-def doubles(*shape: int) -> Tensor:
-    return torch.zeros(shape, dtype=torch.float64)
 
 
 WRONG = {

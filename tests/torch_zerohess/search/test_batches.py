@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from black_boxes import counting
 from every_search import saved
 from searches import bowl, misfit, rays, rays_loss, rosenbrock, spiral, waves, well, zeros
 
@@ -29,10 +30,10 @@ def make(name, **changes):
     return kind(zeros(n) - 0.3, **{"sigma": 1.0, "bounds": (-4.0, 4.0), "seed": 0, "loss": loss, **changes})
 
 
-def rounds(search, f, batch, target, most=200):
+def rounds(search, f, batch, target):
     """Rounds of a batch until a value is at most the target."""
     count = 0
-    while count < most and search.value > target:
+    while count < 200 and search.value > target:
         points = search.ask(batch)
         search.tell(f(points))
         count += math.ceil(len(points) / batch)
@@ -269,12 +270,7 @@ def test_bad_batches_are_named():
 
 
 def test_minimize_gives_batches_to_the_function():
-    sizes = []
-
-    def f(z):
-        sizes.append(len(z))
-        return waves(z)
-
+    f, sizes = counting(waves)
     fit = zh.minimize(
         f,
         zeros(2),

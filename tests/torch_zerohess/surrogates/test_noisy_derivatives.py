@@ -108,8 +108,8 @@ def test_the_choices_are_averaged(monkeypatch):
     torch.testing.assert_close(torch.cat([slope, bend]), size * mixture.sqrt()[[1, 2, 3, 5]])
 
 
-def scores(function, hessian, n=2, runs=16, count=60):
-    """Errors of gradient and Hessian diagonal at 0 over their standard errors [runs, 2n], and the latter [runs, 2n].
+def scores(function, hessian, runs=16, count=60):
+    """Errors of gradient and Hessian diagonal at 0 over their standard errors [runs, 4], and the latter [runs, 4].
 
     Args:
         function: its gradient at 0 is 0.
@@ -118,9 +118,9 @@ def scores(function, hessian, n=2, runs=16, count=60):
     generator, found, sizes = torch.Generator().manual_seed(0), [], []
     for _ in range(runs):
         lengths = torch.rand(count, 1, generator=generator, dtype=torch.float64)
-        points = lengths * torch.randn(count, n, generator=generator, dtype=torch.float64)
+        points = lengths * torch.randn(count, 2, generator=generator, dtype=torch.float64)
         values = function(points) + NOISE * torch.randn(count, generator=generator, dtype=torch.float64)
-        model, width = noisy_derivatives(points.new_zeros(n), points, values, NOISE)
+        model, width = noisy_derivatives(points.new_zeros(2), points, values, NOISE)
         slope, bend = (error / width**k for k, error in enumerate(model.full_errors(), 1))
         off = model.full_hessian().diagonal() / width**2 - hessian
         found.append(torch.cat([model.full_gradient() / width / slope, off / bend]))

@@ -13,13 +13,13 @@ def normal(generator, *shape):
     return torch.randn(*shape, dtype=torch.float64, generator=generator)
 
 
-def filled_pool(n, batches=3, size=4):
+def filled_pool(n, batches=3):
     """A pool, and the batches it was filled with: points, values, centre, sigma."""
     generator = torch.Generator().manual_seed(n)
     pool, drawn = Pool.empty(n), []
     for k in range(batches):
         center, sigma = normal(generator, n), 0.5 + 0.4 * k
-        points = center + sigma * normal(generator, size + k, n)
+        points = center + sigma * normal(generator, 4 + k, n)
         drawn.append((points, points.sum(1), center, sigma))
         pool = pool.add(points, points.sum(1), None, center, sigma)
     return pool, drawn
@@ -118,13 +118,13 @@ def test_outputs_go_with_their_points():
         assert torch.equal(one.values, one.points.sum(1))
 
 
-def thinned(points, losses, keep=0.0):
+def thinned(points, losses):
     """Points that remain of these [P], one parameter."""
     pool = Pool.empty(1)
     for point, loss in zip(points, losses, strict=True):
         pool = pool.add(vector(point)[:, None], vector(loss), vector(loss)[:, None], vector(0.0), 1.0)
-    rest = pool.thin(vector(keep))
-    assert torch.isfinite(rest.weights(vector(keep), 1.0)).all()
+    rest = pool.thin(vector(0.0))
+    assert torch.isfinite(rest.weights(vector(0.0), 1.0)).all()
     return rest.points[:, 0].tolist()
 
 

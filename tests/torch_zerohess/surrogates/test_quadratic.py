@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from searches import sum_of_squares
 
 from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
 from torch_zerohess.surrogates.quadratic import fit_outputs, fit_values
@@ -159,9 +160,9 @@ LOSSES = {
 }
 
 
-def linear_output(n, shape, seed=0):
+def linear_output(n, shape):
     """Returns the target, the intercept c [m], the Jacobian J [m, n] and f(u) = c + J u."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     m = math.prod(shape)
     J, c, target = normal(generator, m, n), normal(generator, m), normal(generator, *shape)
     return target, c, J, lambda u: c + u @ J.mT
@@ -256,10 +257,7 @@ def test_standard_errors_of_outputs_cover_what_is_curved():
         slope = 0.3 * (1.0 + 0.1 * normal(generator, 30, 2))
         target = torch.ones(30, dtype=torch.float64) + 0.1 * normal(generator, 30)
         u = normal(generator, 14, 2)
-
-        def loss(y, target=target):
-            return (y - target).square().sum()
-
+        loss = sum_of_squares(target)
         model = fit_outputs(u, torch.exp(u @ slope.mT), torch.ones(14).double(), loss, torch.Size([30]))
         true = 2.0 * slope.square().sum(0)
         inside.append((model.full_hessian().diagonal() - true).abs() < 2.0 * model.full_errors()[1])

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from torch_zerohess.surrogates.quadratic import coefficients
 from torch_zerohess.surrogates.quadratic_around import quadratic_around
 from truths import normal
 
@@ -21,10 +22,6 @@ def quadratic(n):
     hessian = axes @ torch.diag(100 ** torch.linspace(0, 1, n, dtype=torch.float64)) @ axes.mT
     center = normal(n, seed=3)
     return lambda z: 0.7 + 0.5 * (((z - center) @ hessian) * (z - center)).sum(1), hessian, center
-
-
-def coefficients(n):
-    return (n + 1) * (n + 2) // 2
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 10])

@@ -93,8 +93,9 @@ def test_a_search_may_do_without_robust_errors():
     assert bool((found[0].standard_error > 1.5 * found[1].standard_error).all())
 
 
-def random_case(samples, dtype, keep=12, m=60, n=40):
+def random_case(samples, dtype):
     """Directions, changes, supports with holes, and previous slopes of which some are on the supports."""
+    m, n, keep = 60, 40, 12
     u, d = normal(samples, n).to(dtype), normal(samples, m, seed=1).to(dtype)
     index = normal(m, n, seed=2).argsort(1)[:, :keep]
     used = normal(m, keep, seed=3) < 1.0

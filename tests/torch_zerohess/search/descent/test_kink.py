@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from searches import half_space, hyperbola
 from torch import Tensor
 
 import torch_zerohess as zh
@@ -41,16 +42,6 @@ def test_a_kink_may_be_a_minimum(n) -> None:
         fit = zh.minimize(lambda z: (z - 0.3).abs().sum(1), [0.9] * n, sigma=0.5, restarts=0, seed=seed)
         assert (fit.status, fit.success) == ("solved", True)
         assert fit.value < 1e-4
-
-
-def half_space(z: Tensor, weight: float) -> Tensor:
-    """The minimum 3 of the distance to (1, 2, 3) is where x1 + x2 + x3 = 3."""
-    return (z - torch.tensor([1.0, 2.0, 3.0]).double()).square().sum(1) + weight * (z.sum(1) - 3).clamp(min=0)
-
-
-def hyperbola(z: Tensor, weight: float) -> Tensor:
-    """The minimum 2 of x1 + x2 is where x1 x2 = 1."""
-    return z.sum(1) + weight * (1 - z[:, 0] * z[:, 1]).clamp(min=0)
 
 
 @pytest.mark.parametrize(

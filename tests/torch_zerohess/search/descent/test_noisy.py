@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from searches import run, zeros
+from searches import noisy, run, zeros
 
 from torch_zerohess.optim import Descent
 from torch_zerohess.search.descent import noisy as noisy_descent
@@ -25,17 +25,12 @@ def valley(n, condition, waves=0.0):
     return f
 
 
-def noisy(f, seed, spread=1.0):
-    generator = torch.Generator().manual_seed(seed)
-    return lambda z: f(z) + spread * torch.randn(len(z), generator=generator, dtype=torch.float64)
-
-
-def ends(f, n, evaluations, spread=1.0, seeds=5, start=0.0):
+def ends(f, n, evaluations, seeds=5, start=0.0):
     """Losses without noise where searches are after so many evaluations."""
     found = []
     for seed in range(seeds):
-        search = Descent(zeros(n) + start, sigma=2.0, noise=spread, seed=seed, restarts=0)
-        found.append(float(f(run(search, noisy(f, seed, spread), evaluations).x[None])[0]))
+        search = Descent(zeros(n) + start, sigma=2.0, noise=1.0, seed=seed, restarts=0)
+        found.append(float(f(run(search, noisy(f, 1.0, seed), evaluations).x[None])[0]))
     return found
 
 
@@ -55,7 +50,7 @@ def test_more_evaluations_are_averaged():
 def test_the_best_point_is_what_the_quadratic_says_and_not_the_luckiest():
     f = valley(2, 10.0)
     search = Descent(zeros(2), sigma=2.0, noise=1.0, seed=0, restarts=0)
-    g, lowest = noisy(f, 0), math.inf
+    g, lowest = noisy(f, 1.0, 0), math.inf
     while search.evaluations < 300:
         values = g(search.ask())
         lowest = min(lowest, float(values.min()))
@@ -67,14 +62,14 @@ def test_the_best_point_is_what_the_quadratic_says_and_not_the_luckiest():
 def test_a_region_without_variation_grows():
     """Around the minimum of a bowl that is a tenth of the noise over the first region."""
     search = Descent(torch.ones(3, dtype=torch.float64), sigma=0.3, noise=1.0, seed=0, restarts=0)
-    run(search, noisy(valley(3, 1.0), 0), 100)
+    run(search, noisy(valley(3, 1.0), 1.0, 0), 100)
     assert search.sigma > 1.5
 
 
 def test_a_parameter_without_effect():
     """The metric stretches until the other curvature is as small as its error, and no further."""
     search = Descent(zeros(2), sigma=1.0, noise=0.1, seed=0, restarts=0)
-    run(search, noisy(lambda z: 100 * (z[:, 0] - 1.0).square(), 0, 0.1), 1500)
+    run(search, noisy(lambda z: 100 * (z[:, 0] - 1.0).square(), 0.1, 0), 1500)
     assert float(search.x[0]) == pytest.approx(1.0, abs=0.01)
     assert float(search._state.progress.root.max()) < 3000.0
 
@@ -104,13 +99,13 @@ def test_a_quadratic_is_fitted_to_three_values_for_each_coefficient_or_to_all_in
     monkeypatch.setattr(noisy_descent, "fit_noisy", lambda u, *rest: counts.append(len(u)) or fit(u, *rest))
     monkeypatch.setattr(noisy_descent, "_REGION", region)
     search = Descent(zeros(2), sigma=1.0, noise=1.0, seed=0, restarts=0)
-    run(search, noisy(valley(2, 1.0), 0), 101)
+    run(search, noisy(valley(2, 1.0), 1.0, 0), 101)
     assert least <= counts[-1] <= most
 
 
 def test_a_batch_without_values_leads_back_to_where_there_were_some():
     search = Descent(zeros(2), sigma=1.0, noise=0.1, seed=0)
-    search.tell(noisy(valley(2, 1.0), 0, 0.1)(search.ask()))
+    search.tell(noisy(valley(2, 1.0), 0.1, 0)(search.ask()))
     assert not torch.equal(search.center, zeros(2))
     search.tell(torch.full((len(search.ask()),), math.nan))
     assert torch.equal(search.center, zeros(2))
@@ -120,7 +115,7 @@ def test_a_batch_without_values_leads_back_to_where_there_were_some():
 def test_before_a_quadratic_is_determined_the_value_is_what_is_known_of_the_start():
     """The first batch has 11 values for 21 coefficients."""
     search = Descent(zeros(5), sigma=0.5, noise=0.1, seed=0)
-    search.tell(noisy(valley(5, 1.0), 0, 0.1)(search.ask()))
+    search.tell(noisy(valley(5, 1.0), 0.1, 0)(search.ask()))
     assert search.value == pytest.approx(5.0, abs=0.5)
 
 
@@ -152,14 +147,14 @@ def test_half_of_the_box_has_no_value():
         return torch.where(z[:, 0] > 1.5, math.nan, f(z))
 
     search = Descent(zeros(3), sigma=2.0, bounds=(-4.0, 4.0), noise=0.1, seed=0, restarts=0)
-    run(search, noisy(g, 0, 0.1), 300)
+    run(search, noisy(g, 0.1, 0), 300)
     assert float(f(search.x[None])[0]) < 0.1
 
 
 def test_it_arrives_when_a_fit_has_all_the_evaluations_it_takes(monkeypatch):
     monkeypatch.setattr(noisy_descent, "_MORE", 5)
     search = Descent(zeros(2), sigma=2.0, noise=1.0, seed=0, restarts=1)
-    run(search, noisy(valley(2, 1.0), 0), 2000)
+    run(search, noisy(valley(2, 1.0), 1.0, 0), 2000)
     assert (search.done, search.rounds) == (True, 2)
     assert "within noise" in search.message
     assert search.evaluations < 300
@@ -170,7 +165,7 @@ def test_without_a_box_a_further_round_begins_around_the_first_start(monkeypatch
     monkeypatch.setattr(noisy_descent, "_MORE", 5)
     distances = []
     for seed in range(8):
-        search, f = Descent(zeros(2), sigma=2.0, noise=1.0, seed=seed), noisy(valley(2, 1.0), seed)
+        search, f = Descent(zeros(2), sigma=2.0, noise=1.0, seed=seed), noisy(valley(2, 1.0), 1.0, seed)
         while search.rounds == 0:
             search.tell(f(search.ask()))
         distances.append(float(search.center.square().mean()))
@@ -182,7 +177,7 @@ def test_a_further_round_keeps_the_best_end():
     f = valley(2, 100.0)
     search = Descent(zeros(2), sigma=2.0, bounds=(-5.0, 5.0), noise=1.0, seed=0)
     while search.rounds == 0:
-        search.tell(noisy(f, search.evaluations)(search.ask()))
+        search.tell(noisy(f, 1.0, search.evaluations)(search.ask()))
     end = search.x
-    search.tell(noisy(f, 1)(search.ask()))
+    search.tell(noisy(f, 1.0, 1)(search.ask()))
     assert torch.equal(search.x, end)

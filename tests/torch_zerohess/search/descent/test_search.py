@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, zeros
+from searches import TARGET, bowl, noisy, plateau, rays, rays_loss, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search.descent import pool_quadratic
@@ -62,12 +62,7 @@ def test_an_output_and_a_loss(n, evaluations, seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_does_not_lead_it_astray(seed):
     """Noise of 0.1 on a bowl, told so: the loss where it ends is higher than the lowest by less than the noise."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def f(z):
-        return bowl(z) + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
-
-    search = run(Descent(zeros(2), sigma=2.0, noise=0.1, seed=seed), f, 150)
+    search = run(Descent(zeros(2), sigma=2.0, noise=0.1, seed=seed), noisy(bowl, 0.1, seed), 150)
     assert float(bowl(search.x[None])) < 0.1
 
 

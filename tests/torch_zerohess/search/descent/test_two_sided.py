@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from searches import half_space, hyperbola
 from torch import Tensor
 
 import torch_zerohess as zh
@@ -11,16 +12,6 @@ from torch_zerohess.search.descent.metric_progress import MetricProgress
 from torch_zerohess.search.descent.search import Descent
 from torch_zerohess.search.descent.two_sided import TwoSidedQuadratics, _in_use
 from torch_zerohess.search.protocol.state import Best, Evaluated
-
-
-def half_space(z: Tensor, weight: float) -> Tensor:
-    """The minimum 3 of the distance to (1, 2, 3) is where x1 + x2 + x3 = 3."""
-    return (z - torch.tensor([1.0, 2.0, 3.0]).double()).square().sum(1) + weight * (z.sum(1) - 3).clamp(min=0)
-
-
-def hyperbola(z: Tensor, weight: float) -> Tensor:
-    """The minimum 2 of x1 + x2 is where x1 x2 = 1."""
-    return z.sum(1) + weight * (1 - z[:, 0] * z[:, 1]).clamp(min=0)
 
 
 def product(z: Tensor, weight: float) -> Tensor:

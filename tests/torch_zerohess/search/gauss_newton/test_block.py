@@ -6,16 +6,12 @@ from itertools import pairwise
 import pytest
 import torch
 from scipy.optimize import lsq_linear
-from searches import Linear, run, zeros
+from searches import Linear, run, square, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.search.gauss_newton.block import broyden_update
 from torch_zerohess.search.gauss_newton.by_samples import LENGTHS
 from truths import normal
-
-
-def square(target):
-    return lambda y: (y - target).square().mean()
 
 
 def test_a_jacobian_is_known_after_a_basis_of_samples():
@@ -84,10 +80,10 @@ def test_the_curvature_of_any_loss_is_used():
     assert search.value - lowest < 1e-3 * (first - lowest)
 
 
-def bent(n, m, seed=0):
+def bent(n, m):
     """A black box [K, n] -> [K, m] that is far from linear, and a point."""
-    a = normal(n, m, seed=seed) / math.sqrt(n)
-    return (lambda x: torch.sin(x @ a) + 0.5 * x @ a), 0.7 * normal(n, seed=seed + 1)
+    a = normal(n, m) / math.sqrt(n)
+    return (lambda x: torch.sin(x @ a) + 0.5 * x @ a), 0.7 * normal(n, seed=1)
 
 
 def test_a_bent_black_box_takes_few_blocks():

@@ -6,7 +6,7 @@ import torch
 from torch_zerohess.linalg.krylov import krylov_steps
 from torch_zerohess.search.sparse.steps import sparse_steps
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from truths import normal, vector
+from truths import magnitudes, normal, vector
 
 N = 30
 INF = torch.full((N,), torch.inf).double()
@@ -22,16 +22,12 @@ def twice():
     return SparseJacobian(index, values, torch.zeros_like(values), N, torch.Size([2, N]))
 
 
-def solved(loss, lower=-INF, upper=INF):
-    return sparse_steps(loss, OUTPUT, twice(), RADII, lower, upper)
+def solved(loss, upper=INF):
+    return sparse_steps(loss, OUTPUT, twice(), RADII, -INF, upper)
 
 
 def square(y):
     return y.square().sum()
-
-
-def magnitudes(y):
-    return y.abs().sum()
 
 
 def after(loss, s):

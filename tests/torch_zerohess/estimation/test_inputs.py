@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torch_zerohess import BlackBox, Smoothing, estimate, heads, smooth
+from torch_zerohess import BlackBox, Smoothing, SparseBlackBox, estimate, heads, smooth
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 from torch_zerohess.adapters.onnx import OnnxFunction
 from torch_zerohess.adapters.process import Program
@@ -512,6 +512,12 @@ def test_an_x_that_is_not_finite_is_named_before_fn_is_called() -> None:
     for call in (lambda: BlackBox(never, S)(x), lambda: BlackBox(never, S)(x.requires_grad_())):
         with pytest.raises(ValueError, match="x must be finite, got nan for parameter 1"):
             call()
+
+
+@pytest.mark.parametrize("call", [BlackBox(f, S), lambda x: estimate(f, x, S), SparseBlackBox(f, S)])
+def test_an_x_without_numbers_is_refused(call) -> None:
+    with pytest.raises(TypeError, match="x must have numbers, got a tensor on the device meta"):
+        call(torch.ones(2, device="meta"))
 
 
 def test_a_sparse_x_is_refused() -> None:

@@ -127,7 +127,7 @@ def check_start(start: Evaluated) -> None:
         told = missing if math.isnan(loss) else ""
         raise ValueError(f"loss is {loss} at the start x0, although the output there is finite{told}")
     if start.outputs is None or not math.isfinite(loss):
-        raise ValueError(f"the black box is not finite at the start x0: {loss}")
+        raise ValueError(f"the black box is not finite at the start x0: {loss}; choose another x0")
     count = int((~torch.isfinite(start.outputs[0])).sum())
     raise ValueError(
         f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite, or beyond "

@@ -49,6 +49,7 @@ def test_code_runs(name, tmp_path, monkeypatch):
         assert names["writer"][0].weight.grad.abs().sum() > 0
         spot, images = names["spot"], names["images"]
         assert (spot(names["encoder"](images)) - images).square().mean() < 0.5 * names["before"]
+        assert (names["allowed"].x - 1).abs().max() < 1e-4
         assert (names["fitted"].x - torch.tensor([0.6, 0.3])).abs().max() < 0.01
 
 

@@ -86,6 +86,14 @@ def checked_integer(name: str, value: Any, least: int | None = None) -> int:
     return number
 
 
+def checked_order(value: Any) -> int:
+    """Return the highest order of derivatives. TypeError if it is no integer, ValueError if it is neither 1 nor 2."""
+    order = checked_integer("order", value)
+    if order not in (1, 2):
+        raise ValueError(f"order must be 1 or 2, got {order}")
+    return order
+
+
 def checked_number(
     name: str,
     value: Any,

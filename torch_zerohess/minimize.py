@@ -39,6 +39,8 @@ _OTHER_NAMES = {
     "jac": "nothing: fn is not differentiated",
     "method": "engine",
     "options": "keyword arguments",
+    "constraints": "loss: let fn return the constraints beside the cost, as in loss=lambda y: y[0] + "
+    "50 * y[1:].clamp(min=0).sum()",
 }
 """What other optimizers call it."""
 
@@ -73,7 +75,8 @@ def minimize(
 
     Args:
         fn: [K, n] -> [K] or [K, 1], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and
-            anything else that cannot be differentiated is fine.
+            anything else that cannot be differentiated is fine. Return NaN for a point that cannot be computed, and the
+            search avoids it. An exception ends the search.
         x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution. One that is wider
             than the bounds of a parameter are apart counts as their distance.
@@ -100,8 +103,10 @@ def minimize(
         verbose: whether to write a line to stderr every second, and one at the end.
         seed: of the samples; from torch's global generator if None. The same seed gives the same bits with the same
             number of threads of torch: factorizations of LAPACK round differently with another one.
-        target: the search ends when the value is at most this. In noise a single value is too uncertain: the search
-            ends when a value lies below the target by twice the noise, or when its last decision finds it reached.
+        target: the search ends when the value is at most this, with the status "target". It may also end at a minimum
+            above the target: then `success` is True, too, and the status "solved". In noise a single value is too
+            uncertain: the search ends when a value lies below the target by twice the noise, or when its last decision
+            finds it reached.
         xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,
             in every parameter, and a step has been tried.
         ftol: the search ends when its quadratic model promises a decrease of at most this. Without `loss` the latest

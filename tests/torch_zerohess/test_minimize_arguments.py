@@ -34,6 +34,7 @@ REFUSED = [
     ),
     ({"maxiter": 5}, TypeError, "no argument maxiter; did you mean max_evaluations"),
     ({"restart": 5}, TypeError, "no argument restart; did you mean restarts"),
+    ({"constraints": []}, TypeError, r"no argument constraints; did you mean loss: .* y\[0\] \+ 50 \* y\[1:\]\.clamp"),
     ({"qqq": 5}, TypeError, "no argument qqq; there are"),
     ({"max_evaluations": None}, TypeError, "max_evaluations must be an integer, got None"),
     ({"max_evaluations": 1e3}, TypeError, "max_evaluations must be an integer, got 1000.0"),

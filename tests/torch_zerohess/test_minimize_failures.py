@@ -119,4 +119,7 @@ def test_an_error_names_the_first_point_without_a_value() -> None:
     with pytest.raises(ValueError, match="lost the scene") as raised:
         zh.minimize(fn, [0.0, 0.0], sigma=1.0, seed=0, noise=0.0, vectorized=False)
     x, y = calls[-1].tolist()
-    assert raised.value.__notes__ == [f"fn was called at the point [{x:.6g}, {y:.6g}]"]
+    assert raised.value.__notes__ == [
+        f"fn was called at the point [{x:.6g}, {y:.6g}]. Where nothing can be computed, let it return NaN: the search "
+        "avoids such points"
+    ]

@@ -18,18 +18,16 @@ Example: where is the ball, and how bright is it? The points are [K, 3]: two len
 
 import copy
 import difflib
-import os
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torch_zerohess.adapters.mitsuba_description import Description, described, loaded
 from torch_zerohess.adapters.mitsuba_film import resize
 from torch_zerohess.adapters.mitsuba_parameters import Parameter, plain
 from torch_zerohess.adapters.mitsuba_transforms import Transform
@@ -39,8 +37,6 @@ from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.process_identity import own_seed
 
 __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
-
-Description = Mapping[str, Any] | str | os.PathLike[str] | Callable[[ModuleType], Mapping[str, Any]]
 
 _MOST = 2**31
 """Mitsuba's integers are below this."""
@@ -118,13 +114,13 @@ class MitsubaScene:
         self.mi: Any = select_variant(variant, threads)
         self.variant: str = self.mi.variant()
         self.spp, self.seed, self.noise, self.loss, self.nan = spp, int(seed), noise, loss, nan  # no seed of NumPy
-        described = _described(self.mi, description)
-        self.scene: Any = _load(self.mi, described)
+        found = described(self.mi, description)
+        self.scene: Any = loaded(self.mi, found)
         self.values: Any = self.mi.traverse(self.scene)
         """Of `mitsuba.traverse`."""
         if film is not None:
             width, height = plain(film)
-            resize(self.mi, self.values, (width, height), described)
+            resize(self.mi, self.values, (width, height), found)
         if depth is not None:
             integrator = {"type": "path", "max_depth": depth, "rr_depth": depth}
         self.integrator: Any = None if integrator is None else self.mi.load_dict(dict(integrator))
@@ -159,6 +155,17 @@ class MitsubaScene:
         settings = f"film=({width}, {height}), spp={self.spp}, noise={self.noise!r}, variant={self.variant!r}"
         some = ", ".join(self.labels[:4]) + ", ..." * (self.n > 4)
         return f"MitsubaScene(n={self.n}, parameters=[{some}], {settings})"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a MitsubaScene cannot be pickled: pass evaluators.Factory(MitsubaScene, ...), with the arguments of the "
+            "scene, which each process makes for itself"
+        )
+
+    def __copy__(self) -> "MitsubaScene":
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        return other
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "MitsubaScene":
         memo[id(self)] = other = copy.copy(self)
@@ -248,28 +255,6 @@ class MitsubaScene:
                 f'at row {wrong[0][0]}, column {wrong[0][1]}; nan="keep" leaves them to on_nonfinite of BlackBox'
             )
         return torch.from_numpy(image)
-
-
-def _described(mi: Any, description: Description) -> dict[str, Any] | Path:
-    """Return what `load_dict` takes, or the path of a file that exists."""
-    if not isinstance(description, (str, os.PathLike)):
-        return dict(description(mi) if callable(description) else description)
-    path = Path(description)
-    if not path.is_file():
-        raise FileNotFoundError(f"description: there is no file {path}")
-    return path
-
-
-def _load(mi: Any, description: dict[str, Any] | Path) -> Any:
-    """`optimize=False` keeps the names of the parameters."""
-    try:
-        if isinstance(description, Path):
-            return mi.load_file(str(description), optimize=False)
-        return mi.load_dict(description, optimize=False)
-    except RuntimeError as error:
-        if "No such file" in str(error) or "does not exist" in str(error):
-            raise FileNotFoundError(f"description: {error}") from error
-        raise
 
 
 def _unknown(name: str, known: Sequence[str]) -> str:

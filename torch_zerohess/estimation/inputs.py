@@ -26,6 +26,10 @@ def checked_input(x: Any, *, empty: bool = False) -> Tensor:
     _check_not_nested("x", x)
     if x.layout != torch.strided:
         raise TypeError(f"x must be dense, got {x.layout}: convert by x.to_dense()")
+    if x.device.type == "meta":
+        raise TypeError(
+            "x must have numbers, got a tensor on the device meta, which has none: move it to another device"
+        )
     if x.dim() == 0 or x.shape[-1] == 0 or (x.numel() == 0 and not empty):
         wanted = "n > 0" if empty else "n and every batch dimension > 0"
         raise ValueError(f"x must have shape [*batch, n] with {wanted}, got {list(x.shape)}")

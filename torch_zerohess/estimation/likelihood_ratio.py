@@ -1,5 +1,6 @@
 """Weights N/p of samples from a density p: one set of samples serves value, gradient, Hessian and every product."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,9 @@ from torch_zerohess.sampling import kernels, proposals, samplers, stein_sums
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 from torch_zerohess.sampling.stein_sums import total
 from torch_zerohess.smoothing import Smoothing
+
+_FEW = 3
+"""Parameters up to which any number of samples of "uniform" is accepted."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +31,11 @@ class LikelihoodRatio(Divisible):
     def draw(
         cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "LikelihoodRatio"]:
-        """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
+        """See `Stein.draw`; ValueError if none of the samples of "uniform" counts."""
         B, n = x.shape
         density, single = _density(smoothing), x.dtype == torch.float32
+        if density == proposals.UNIFORM:
+            _check_samples(smoothing.samples, n)
         if smoothing.sampler == "random":  # of the K rows only the points exist at once unless they are kept
             rows, points, u, weight = kernels.sample(
                 seed, smoothing.samples, x, sigma, smoothing.paired, density, center, keep
@@ -39,10 +45,6 @@ class LikelihoodRatio(Divisible):
             drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
             points, u, weight = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
             points, made = completed(points, x, center), cls(u, weight)
-        if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):
-            raise ValueError(
-                f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
-            )
         return points, made
 
     @classmethod
@@ -116,6 +118,21 @@ class LikelihoodRatio(Divisible):
 def _kept(smoothing: Smoothing, keep: bool) -> bool:
     """Only independent rows can be drawn again one by one."""
     return keep or smoothing.sampler != "random"
+
+
+def _check_samples(samples: int, n: int) -> None:
+    """Raise ValueError if fewer than one sample of "uniform" counts with more than three parameters.
+
+    The samples near x then carry all the weight, and none is near it: derivatives are near 0, and so are their standard
+    errors. Up to three parameters they are only inexact.
+    """
+    counts = proposals.BOX_COUNTS
+    if n > _FEW and math.log(samples) + n * math.log(counts) < 0.0:
+        raise ValueError(
+            f"samples must be at least {1 / counts:.2f}^{n} for proposal 'uniform' with {n} parameters, got {samples}: "
+            "a smaller number has no sample that counts, (sum of weights)^2 / (sum of squared weights) < 1; use "
+            "proposal 'aggregate'"
+        )
 
 
 def _density(smoothing: Smoothing) -> int:

@@ -53,4 +53,5 @@ def _say_where(error: Exception, points: list[Tensor]) -> None:
     """Add a note to an error that says at which point [n], or at which of several, fn was."""
     if points:
         places = [f"[{numbers_of(one)}]" for one in points[:_NAMED]] + ["..."] * (len(points) > _NAMED)
-        add_note(error, f"fn was called at the point{'s' if len(points) > 1 else ''} {', '.join(places)}")
+        called = f"fn was called at the point{'s' if len(points) > 1 else ''} {', '.join(places)}"
+        add_note(error, f"{called}. Where nothing can be computed, let it return NaN: the search avoids such points")

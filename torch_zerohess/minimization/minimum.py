@@ -64,8 +64,9 @@ class Minimum:
         values: [evaluations], float64, the losses there; NaN where an output is not finite.
         history: `points` and `values` as a list of `Observation`.
         noise: standard deviation of repeated losses at one point, as it was given or measured at x0; 0 without noise.
-        success: whether the target was reached, or the search has found x to be a minimum, possibly a local one. After
-            that it may have looked for a lower one until its evaluations were used up: then the status is "budget".
+        success: whether the target was reached, or the search has found x to be a minimum, possibly a local one, which
+            may lie above the target: `status` says which. After it has found a minimum it may have looked for a lower
+            one until its evaluations were used up: then the status is "budget".
         status: target: the value is at most the target. solved: the search has ended at a minimum, possibly a local
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and, unless
             several rounds agree, where fn jumps, fails, is constant or has a cusp at x, or a kink whose slopes do not

@@ -34,6 +34,8 @@ KIND = {GAUSSIAN: NORMAL, UNIFORM: BOX, SIGNED_LOBES: EVERY_GRADIENT_LOBE}
 """Kind of all rows of the densities that are no mixtures."""
 
 BOX_HALF_WIDTH = 5.0
+BOX_COUNTS = 0.35449077018110320546
+"""Share of the samples from the box that count, per parameter: (E w)^2 / E w^2 = sqrt(pi) / BOX_HALF_WIDTH."""
 _SQRT_HALF_PI = 1.2533141373155003
 _HALF_PI = 1.5707963267948966
 _DIAGONAL_LOBE_SCALE = 1.0331828385306232  # sqrt(2 pi e) / 4

@@ -1,17 +1,17 @@
 """Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
 
-import functools
 import threading
-from collections.abc import Callable
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.arguments import check_state, checked_integer
+from torch_zerohess.arguments import check_state, checked_integer, checked_order
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.checked_setting import CheckedSetting
 from torch_zerohess.surrogates.coefficient import Coefficient
+from torch_zerohess.surrogates.locking import locked
 from torch_zerohess.surrogates.surrogate import Surrogate, check_surrogate, floating, outside_inference
 from torch_zerohess.surrogates.thinning import farthest_from_later
 from torch_zerohess.version import VERSION
@@ -22,20 +22,8 @@ _FEWEST = 8
 """Evaluations at the first fit, and the least capacity: with less there would never be a fit."""
 _KEPT = 0.9
 """Share of the capacity that thinning leaves: it takes long, and must not follow every call."""
-
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
-
-
-def _locked(method: "Callable[Concatenate[Memory, _P], _T]") -> "Callable[Concatenate[Memory, _P], _T]":
-    """Return a method of a memory that no other thread interrupts: it waits for a call that is under way."""
-
-    @functools.wraps(method)
-    def called(self: "Memory", /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        with self.lock:
-            return method(self, *args, **kwargs)
-
-    return called
+_ALL = 1 << 62
+"""Capacity of the memory's own surrogate, which is fitted to all evaluations that are kept."""
 
 
 class Memory:
@@ -83,6 +71,8 @@ class Memory:
             parameters 4, or 64 with kinks or jumps; for fewer 1024 / B and at least 64. An affine surrogate under
             `heads.SquaredError` needs none in a layer: the expectation is known.
 
+    `capacity`, `fresh`, `order` and `draws` may be set between calls.
+
     Raises:
         TypeError, ValueError: an argument is not as described.
 
@@ -95,6 +85,11 @@ class Memory:
         (30, True)
     """
 
+    capacity = CheckedSetting(lambda value: checked_integer("capacity", value, _FEWEST), lambda memory: memory._thin())
+    fresh = CheckedSetting(lambda value: None if value is None else checked_integer("fresh", value, 0))
+    order = CheckedSetting(checked_order)
+    draws = CheckedSetting(lambda value: None if value is None else checked_integer("draws", value, 3))
+
     def __init__(
         self,
         surrogate: Surrogate | nn.Module | None = None,
@@ -104,24 +99,19 @@ class Memory:
         order: int = 2,
         draws: int | None = None,
     ) -> None:
-        capacity = checked_integer("capacity", capacity, _FEWEST)
-        fresh = None if fresh is None else checked_integer("fresh", fresh, 0)
-        draws = None if draws is None else checked_integer("draws", draws, 3)
-        check_surrogate(surrogate)
-        self.surrogate: Any = AutomaticSurrogate(capacity=capacity) if surrogate is None else surrogate
-        if checked_integer("order", order) not in (1, 2):
-            raise ValueError(f"order must be 1 or 2, got {order}")
+        self._points: list[Tensor] = []
+        self._outputs: list[Tensor] = []
+        self._size = 0
+        self.lock = threading.RLock()
+        """Held during a call, so that the surrogate does not change in it, and by what reads or changes evaluations."""
         self.capacity, self.fresh, self.order, self.draws = capacity, fresh, order, draws
+        check_surrogate(surrogate)
+        self.surrogate: Any = AutomaticSurrogate(capacity=_ALL) if surrogate is None else surrogate  # all of them
         self.evaluations = 0
         """Evaluations taken so far, those that are no longer kept included."""
         self.pathwise: int | None = None
         """Orders of pathwise derivatives of the surrogate's term, 0, 1 or 2, see `estimation.surrogate_term`; None: to
         be measured."""
-        self.lock = threading.RLock()
-        """Held during a call, so that the surrogate does not change in it, and by what reads or changes evaluations."""
-        self._points: list[Tensor] = []
-        self._outputs: list[Tensor] = []
-        self._size = 0
         self._fitted = 0
         """Evaluations taken at the last fit."""
         self._rows = 0
@@ -136,14 +126,14 @@ class Memory:
         return self._size
 
     @property
-    @_locked
+    @locked
     def points(self) -> Tensor:
         """Points of the evaluations that are kept, [P, n]; not a copy: clone it before you change it."""
         self._points = _joined(self._points)
         return self._points[0] if self._points else torch.empty(0, 0, device="cpu")
 
     @property
-    @_locked
+    @locked
     def outputs(self) -> Tensor:
         """Outputs there, [P, *out]; not a copy, either."""
         self._outputs = _joined(self._outputs)
@@ -159,7 +149,7 @@ class Memory:
         if self._points and (kept := self._points[0].shape[1]) != n:
             raise ValueError(f"x must have {kept} parameters like the evaluations in memory, got {n}")
 
-    @_locked
+    @locked
     def add(self, points: Tensor, outputs: Tensor) -> None:
         """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
 
@@ -186,10 +176,9 @@ class Memory:
             self._points.append(points[finite])
             self._outputs.append(outputs[finite])
         self._size += len(self._points[-1])
-        if self._size > self.capacity:
-            self._thin()
+        self._thin()
 
-    @_locked
+    @locked
     def fit(self) -> None:
         """Fit the surrogate to all evaluations that are kept; a module without `fit` is left as it is.
 
@@ -211,7 +200,7 @@ class Memory:
                     points, outputs = points.clone(), outputs.clone()
                 self.surrogate.fit(points, outputs)
 
-    @_locked
+    @locked
     def refresh(self) -> None:
         """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""
         if self._size >= _FEWEST and self.evaluations >= _GROWTH * self._fitted:
@@ -227,15 +216,18 @@ class Memory:
         """Coefficient c in [0, 1] of the surrogate's values in the next call; see `Coefficient`."""
         return 1.0 if self.fresh == 0 else self.regression.value
 
+    @locked
     def _thin(self) -> None:
-        """Drop points down to a share of the capacity."""
+        """Drop points down to a share of the capacity, if there are more than the capacity."""
+        if self._size <= self.capacity:
+            return
         first = max(self._size - 2 * self.capacity, 0)  # older ones go first, so that distances are few
         kept = first + farthest_from_later(self.points[first:], max(_FEWEST, int(_KEPT * self.capacity)))
         with outside_inference():
             self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
         self._size, self._rows = len(kept), int((kept < self._rows).sum())
 
-    @_locked
+    @locked
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the settings: evaluations, the coefficient, and the state of the surrogate if any."""
         model = self.surrogate.state_dict() if isinstance(self.surrogate, nn.Module) else None
@@ -252,7 +244,7 @@ class Memory:
             "version": VERSION,
         }
 
-    @_locked
+    @locked
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew.
 
@@ -267,6 +259,7 @@ class Memory:
         self.regression.moments = [list(one) for one in state["moments"]]
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
         self._known = state["known"]
+        self._thin()
         if isinstance(self.surrogate, nn.Module) == (state["surrogate"] is None):
             self.regression.moments = []  # of a surrogate of another kind
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
@@ -276,7 +269,7 @@ class Memory:
         elif self._rows > 1:
             self._fit_rows()
 
-    @_locked
+    @locked
     def __getstate__(self) -> dict[str, Any]:
         found = {name: value for name, value in vars(self).items() if name != "lock"}
         return {**found, "_points": [*self._points], "_outputs": [*self._outputs]}

@@ -106,8 +106,10 @@ def check_samples(samples: int, keep: int, dropped: int = 0) -> None:
     least = fewest_samples(keep)
     if samples - dropped < least:
         lost = f", of which {dropped} were dropped because their outputs are not finite" if dropped else ""
+        fewer = samples - dropped - 2
+        remedy = f"; or give keep={fewer}, if no output depends on more" if fewest_samples(fewer) <= fewer + 2 else ""
         raise ValueError(
-            f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}{lost}"
+            f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}{lost}{remedy}"
         )
 
 

@@ -32,6 +32,9 @@ class Surrogate(Protocol):
 
 def check_surrogate(surrogate: Any) -> None:
     """Raise TypeError for what is neither None nor a surrogate, ValueError for a module that mixes points."""
+    if isinstance(surrogate, type):
+        name = surrogate.__name__
+        raise TypeError(f"surrogate must be an object, got the class {name}: pass an instance, {name}(...)")
     if surrogate is not None and not callable(surrogate):
         raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
     if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):

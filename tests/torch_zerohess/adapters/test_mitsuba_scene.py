@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import copy
 import math
+import pickle
 import threading
 from pathlib import Path
 from unittest.mock import patch
@@ -464,6 +465,13 @@ def test_a_deep_copy_shares_the_scene_and_counts_its_own_calls() -> None:
     assert float(other(x)) != 7.0
     other.x0.zero_()
     assert bool((scene.x0 == 0.5).all())
+
+
+def test_a_scene_that_is_pickled_names_the_factory() -> None:
+    scene = scalar(lamp, [Value(RADIANCE)])
+    with pytest.raises(TypeError, match=r"a MitsubaScene cannot be pickled: pass evaluators\.Factory\(MitsubaScene"):
+        pickle.dumps(scene)
+    assert copy.copy(scene).scene is scene.scene
 
 
 def test_the_average_of_a_model_with_a_scene() -> None:

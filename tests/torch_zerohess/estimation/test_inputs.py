@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torch_zerohess import BlackBox, Smoothing, estimate, heads, smooth
+from torch_zerohess import BlackBox, Smoothing, SparseBlackBox, estimate, heads, smooth
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 from torch_zerohess.adapters.onnx import OnnxFunction
 from torch_zerohess.adapters.process import Program
+from torch_zerohess.autograd import tracing
 from torch_zerohess.evaluators import Factory
 from truths import spread, squares, vector
 
@@ -373,6 +374,32 @@ def test_optimal_sampling_stops_at_a_million_evaluations() -> None:
     assert most.replace(samples=3).evaluations(1000, center=False) == 3_009_006
 
 
+def test_uniform_samples_of_which_none_counts_are_refused_before_fn_is_called() -> None:
+    """(E w)^2 / E w^2 of w = N / p is (sqrt(pi) / 5)^n for a box of 5 sigma: one in 63.3 samples with four parameters.
+
+    With 64 samples and 20 parameters a gradient of norm 8.9 would be 1e-4, and so would its standard error.
+    """
+    calls = []
+    few, enough = (S.replace(proposal="uniform", samples=samples) for samples in (63, 64))
+    layer, x = BlackBox(lambda z: calls.append(1) or f(z), few), torch.ones(4)
+    compiled = torch.compile(layer, fullgraph=True, backend="eager") if tracing.GRAPHS else layer
+    with torch.no_grad():
+        layer(x)
+    calls.clear()
+    for call in (
+        lambda: estimate(layer.call.fn, x, few),
+        lambda: layer(x.clone().requires_grad_()),
+        lambda: compiled(x.clone().requires_grad_()),
+        lambda: torch.func.hessian(layer)(x),
+        lambda: estimate(layer.call.fn, torch.ones(1024), enough),
+    ):
+        with pytest.raises(ValueError, match=r"samples must be at least 2\.82\^\d+ for proposal 'uniform' with"):
+            call()
+    assert not calls
+    estimate(f, x, enough)
+    estimate(f, torch.ones(3), enough.replace(samples=1))
+
+
 FIRST_ORDER = "first derivatives only .*use Smoothing\\(proposal='aggregate', order=2\\)"
 
 
@@ -460,6 +487,7 @@ def test_shapes_symmetry_and_linearity(
     batch: list[int], n: int, out: list[int], samples: int, proposal: str, baseline: str, antithetic: bool,
     single: bool, seed: int,
 ) -> None:  # fmt: skip
+    n = min(n, 3) if proposal == "uniform" else n
     smoothing = Smoothing(
         sigma=0.3, samples=samples, proposal=proposal, baseline=baseline, antithetic=antithetic, seed=seed
     )
@@ -492,6 +520,12 @@ def test_an_x_that_is_not_finite_is_named_before_fn_is_called() -> None:
     for call in (lambda: BlackBox(never, S)(x), lambda: BlackBox(never, S)(x.requires_grad_())):
         with pytest.raises(ValueError, match="x must be finite, got nan for parameter 1"):
             call()
+
+
+@pytest.mark.parametrize("call", [BlackBox(f, S), lambda x: estimate(f, x, S), SparseBlackBox(f, S)])
+def test_an_x_without_numbers_is_refused(call) -> None:
+    with pytest.raises(TypeError, match="x must have numbers, got a tensor on the device meta"):
+        call(torch.ones(2, device="meta"))
 
 
 def test_a_sparse_x_is_refused() -> None:

@@ -193,8 +193,55 @@ def test_a_module_without_fit_is_ready_and_never_fitted() -> None:
     ],
 )
 def test_wrong_settings_raise(options, error) -> None:
-    with pytest.raises(error, match=next(iter(options))):
+    """Also those that are set later, which then stay as they were."""
+    ((name, value),) = options.items()
+    with pytest.raises(error, match=name):
         Memory(**options)
+    if name != "surrogate":
+        memory = Memory()
+        before = getattr(memory, name)
+        with pytest.raises(error, match=name):
+            setattr(memory, name, value)
+        assert getattr(memory, name) == before
+
+
+@pytest.mark.parametrize("kind", [zh.surrogates.ProcessSurrogate, Counting, nn.Linear])
+def test_a_class_is_no_surrogate(kind) -> None:
+    with pytest.raises(TypeError, match=rf"got the class {kind.__name__}: pass an instance, {kind.__name__}\("):
+        Memory(kind)
+
+
+def test_settings_may_be_set_later_and_a_smaller_capacity_thins_at_once() -> None:
+    memory, z = Memory(LinearSurrogate(), capacity=60), normal(60, 2)
+    memory.add(z, z)
+    memory.fit()
+    memory.capacity, memory.fresh = 20, 2
+    assert (len(memory), memory.evaluations, memory.fresh) == (18, 60, 2)
+    assert bool((memory.points[:, None] == z).all(2).any(1).all())
+    assert torch.equal(memory.points[-1], z[-1])
+    copied = copy.deepcopy(memory)
+    assert (copied.capacity, copied.fresh, copied.order, copied.draws) == (20, 2, 2, None)
+
+
+def test_a_larger_capacity_serves_the_surrogate_too() -> None:
+    """The later half of the points is at 1: without the first one, the parabola is not known at -1."""
+    memory, z = Memory(capacity=20), torch.linspace(-2, 1, 40)[:, None].double()
+    memory.capacity = 40
+    memory.add(z, z.square())
+    memory.fit()
+    assert float(memory.surrogate(z[:1])) == pytest.approx(4.0, abs=0.01)
+
+
+def test_a_state_that_is_loaded_into_a_smaller_memory_is_thinned() -> None:
+    """And the surrogate is fitted to the points that are left: here a parabola, which they determine."""
+    memory, loaded, z = Memory(), Memory(capacity=20), normal(60, 2)
+    memory.add(z, z.square().sum(1))
+    memory.fit()
+    loaded.load_state_dict(memory.state_dict())
+    assert (len(loaded), loaded.evaluations, loaded.output_shape) == (18, 60, ())
+    assert bool((loaded.points[:, None] == z).all(2).any(1).all())
+    torch.testing.assert_close(loaded.outputs, loaded.points.square().sum(1))
+    torch.testing.assert_close(loaded.surrogate(loaded.points), loaded.outputs, rtol=0, atol=0.05)
 
 
 @pytest.mark.parametrize(("shape", "text"), [((), "[K]"), ((3, 2), "[K, 3, 2]")])

@@ -367,11 +367,19 @@ def test_parts_are_spaced_by_their_energy():
 
 
 def test_a_fit_takes_eight_samples():
-    with pytest.raises(ValueError, match="samples must be at least 8 to fit 2 parameters per output"):
+    with pytest.raises(ValueError, match=r"samples must be at least 8 to fit 2 parameters per output \(keep\), got 7$"):
         check_samples(7, 2)
     check_samples(8, 2)
     with pytest.raises(ValueError, match="at least 12 "):
         check_samples(11, 10)
+
+
+@pytest.mark.parametrize(("samples", "dropped", "keep"), [(8, 0, 6), (12, 3, 7)])
+def test_fewer_samples_fit_fewer_parameters(samples, dropped, keep):
+    """Six kept entries and a constant need eight samples; with the named number the samples are enough."""
+    with pytest.raises(ValueError, match=rf"at least 18 .* or give keep={keep}, if no output depends on more"):
+        check_samples(samples, 16, dropped)
+    check_samples(samples, keep, dropped)
 
 
 def test_held_out_elements_are_bands_of_four_rows():

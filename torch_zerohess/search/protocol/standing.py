@@ -28,6 +28,11 @@ class Standing(ABC, Generic[P]):
         return self._method.engine
 
     @property
+    def reason(self) -> str:
+        """Why this engine, in a sentence."""
+        return "the caller chose it"
+
+    @property
     def loss(self) -> Callable[[Tensor], Tensor] | None:
         """The white box from an output to a number; None where the black box returns the loss."""
         return self._method.settings.loss

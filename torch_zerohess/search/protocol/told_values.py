@@ -136,7 +136,7 @@ def check_start(start: Evaluated) -> None:
         told = missing if math.isnan(loss) else ""
         raise ReturnedValueError(f"loss is {loss} at the start x0, although the output there is finite{told}")
     if start.outputs is None or not math.isfinite(loss):
-        raise ReturnedValueError(f"the black box is not finite at the start x0: {loss}")
+        raise ReturnedValueError(f"the black box is not finite at the start x0: {loss}; choose another x0")
     count = int((~torch.isfinite(start.outputs[0])).sum())
     raise ReturnedValueError(
         f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite, or beyond "

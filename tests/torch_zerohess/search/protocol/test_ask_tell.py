@@ -427,7 +427,7 @@ def test_not_finite_at_the_start(name):
     before = search.state_dict()
     values = f(search.ask())
     values[0] = math.nan
-    with pytest.raises(ValueError, match="not finite at the start x0: nan"):
+    with pytest.raises(ValueError, match="not finite at the start x0: nan; choose another x0"):
         search.tell(values)
     assert same(search.state_dict(), before)
     search.tell(f(search.ask()))
@@ -584,3 +584,10 @@ def test_masked_values_are_told_as_missing():
     assert torch.equal(search.ask(), other.ask())
     with pytest.raises(TypeError, match="complex"):
         search.tell(search.ask()[:, 0] * 1j)
+
+
+@every_search
+def test_every_search_says_why_it_is_the_one(name):
+    search = make(name)
+    assert isinstance(search, TrustRegion) == (search.reason != "the caller chose it")
+    assert search.reason

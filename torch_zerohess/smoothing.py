@@ -49,11 +49,11 @@ class Smoothing:
         proposal: density the perturbations are drawn from.
             "aggregate" mixes the lobes of the kernel's first and second derivative over all dimensions with a Gaussian
             share and divides by the density of that mixture; "gaussian" is the plain normal; "uniform" a box of +-5
-            sigma, for comparison, with at least 2.82^n samples for n > 3 parameters; "optimal" one sample set per
-            element of gradient and Hessian, with constant weights (samples is then per element); "fr22" all dimensions
-            from the signed first-derivative lobe, first order only, a baseline of the literature (Fischer and Ritschel
-            2023). Its gradient is biased for n > 1, and its smoothed value for every n: in one dimension the smoothed
-            value of x^2 is x^2 + 2 sigma^2 instead of x^2 + sigma^2.
+            sigma, for comparison, with a warning for fewer than 2.82^n samples of n > 3 parameters; "optimal" one
+            sample set per element of gradient and Hessian, with constant weights (samples is then per element); "fr22"
+            all dimensions from the signed first-derivative lobe, first order only, a baseline of the literature
+            (Fischer and Ritschel 2023). Its gradient is biased for n > 1, and its smoothed value for every n: in one
+            dimension the smoothed value of x^2 is x^2 + 2 sigma^2 instead of x^2 + sigma^2.
         antithetic: use every perturbation with both signs.
         baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws; "none" nothing. "mean" and
             "none" do not need f(x); it is evaluated beside them if value="center". The baseline changes the variance,

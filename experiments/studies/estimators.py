@@ -30,10 +30,6 @@ class Estimator:
     order: Literal[1, 2] = 2
     """Highest derivative: with 1 there are neither lobes nor sample sets for the second."""
 
-    def refused(self, n: int) -> bool:
-        """Whether so many parameters leave too few of its samples that count."""
-        return self.proposal == "uniform" and n > 3
-
     def samples(self, budget: int, n: int) -> int:
         """Return how many evaluations every element of a quantity is a mean of."""
         return self.smoothing(budget, n, 1.0, 0).samples * (2 if self.antithetic else 1)

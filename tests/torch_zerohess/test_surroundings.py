@@ -169,6 +169,11 @@ def test_newton_cg_leaves_parameters_as_they_were_when_it_fails():
     assert torch.equal(y.detach(), start)
 
 
+def test_settings_that_cannot_work_say_so():
+    with pytest.raises(ValueError, match="no weight left at 1024 parameters"):
+        zh.estimate(f, torch.zeros(1024), S.replace(proposal="uniform"))
+
+
 @contextlib.contextmanager
 def default_dtype(dtype):
     before = torch.get_default_dtype()

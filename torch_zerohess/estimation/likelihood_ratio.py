@@ -1,6 +1,7 @@
 """Weights N/p of samples from a density p: one set of samples serves value, gradient, Hessian and every product."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from torch_zerohess.sampling.stein_sums import total
 from torch_zerohess.smoothing import Smoothing
 
 _FEW = 3
-"""Parameters up to which any number of samples of "uniform" is accepted."""
+"""Parameters up to which any number of samples of "uniform" goes without a warning."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,12 @@ class LikelihoodRatio(Divisible):
     def draw(
         cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "LikelihoodRatio"]:
-        """See `Stein.draw`; ValueError if none of the samples of "uniform" counts."""
+        """See `Stein.draw`.
+
+        Warns if none of the samples of "uniform" counts; ValueError if all weights of a point underflow to zero.
+        """
         B, n = x.shape
         density, single = _density(smoothing), x.dtype == torch.float32
-        if density == proposals.UNIFORM:
-            _check_samples(smoothing.samples, n)
         if smoothing.sampler == "random":  # of the K rows only the points exist at once unless they are kept
             rows, points, u, weight = kernels.sample(
                 seed, smoothing.samples, x, sigma, smoothing.paired, density, center, keep
@@ -45,6 +47,12 @@ class LikelihoodRatio(Divisible):
             drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
             points, u, weight = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
             points, made = completed(points, x, center), cls(u, weight)
+        if density == proposals.UNIFORM:
+            if bool((weight == 0).all(1).any()):
+                raise ValueError(
+                    f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
+                )
+            _warn_of_few(smoothing.samples, n)
         return points, made
 
     @classmethod
@@ -120,18 +128,18 @@ def _kept(smoothing: Smoothing, keep: bool) -> bool:
     return keep or smoothing.sampler != "random"
 
 
-def _check_samples(samples: int, n: int) -> None:
-    """Raise ValueError if fewer than one sample of "uniform" counts with more than three parameters.
+def _warn_of_few(samples: int, n: int) -> None:
+    """Warn if fewer than one sample of "uniform" counts with more than three parameters.
 
-    The samples near x then carry all the weight, and none is near it: derivatives are near 0, and so are their standard
-    errors. Up to three parameters they are only inexact.
+    The samples near x carry all the weight. None is near it, so derivatives are near 0, and so are their standard
+    errors. With up to three parameters they are only inexact.
     """
     counts = proposals.BOX_COUNTS
     if n > _FEW and math.log(samples) + n * math.log(counts) < 0.0:
-        raise ValueError(
-            f"samples must be at least {1 / counts:.2f}^{n} for proposal 'uniform' with {n} parameters, got {samples}: "
-            "a smaller number has no sample that counts, (sum of weights)^2 / (sum of squared weights) < 1; use "
-            "proposal 'aggregate'"
+        warnings.warn(
+            f"proposal 'uniform' with {n} parameters needs at least {1 / counts:.2f}^{n} samples, got {samples}: "
+            "derivatives and their standard errors are near 0, because no sample is near x; use proposal 'aggregate'",
+            stacklevel=2,
         )
 
 

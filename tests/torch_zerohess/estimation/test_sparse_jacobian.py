@@ -82,7 +82,10 @@ def test_intervals_cover_the_slope(fn, slope, samples, antithetic):
     assert within(1.96) == pytest.approx(0.95, abs=0.04)
 
 
-@pytest.mark.parametrize(("n", "samples", "keep", "least"), [(4, 150, 1, 8), (5, 400, 4, 8), (3, 20, 1, 8)])
+@pytest.mark.filterwarnings("ignore:proposal 'uniform'")
+@pytest.mark.parametrize(
+    ("n", "samples", "keep", "least"), [(60, 400, 1, 8), (60, 400, 16, 18), (10, 400, 4, 8), (3, 20, 1, 8)]
+)
 def test_uniform_samples_of_which_few_count_are_refused(n, samples, keep, least):
     x, settings = torch.zeros(n).double(), zh.Smoothing(sigma=0.5, samples=samples, proposal="uniform", seed=0)
     with pytest.raises(

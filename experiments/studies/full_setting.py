@@ -75,8 +75,7 @@ def saving(task: RenderedTask, whole: RenderedTask) -> Saving:
 
 
 def _measured(task: RenderedTask, points: Tensor) -> tuple[float, Tensor]:
-    """Return the median seconds of an evaluation and the losses [P]; the scene is loaded and compiled before."""
-    task.loss(points[:1])
+    """Return seconds of an evaluation and the losses [P]; the first one, which loads the scene, moves no median."""
     seconds, losses = [], []
     for point in points:
         begin = time.process_time()

@@ -47,6 +47,9 @@ COMMANDS = {
         "studies.smoothing_laws:smoothing_laws", "errors with other laws of the noise", long=True
     ),
     "nonpsd": Command("studies.nonpsd:nonpsd_error", "error of the Hessian where it is indefinite"),
+    "full_setting": Command(
+        "studies.full_setting:full_setting", "time and loss of tasks in the source's setting", long=True
+    ),
     "losses": Command("studies.losses:losses", "a loss inside the black box, or after an image", long=True),
     "gradients": Command("studies.gradients:gradients", "derivatives by the renderer and by sampling", long=True),
     "robustness": Command("studies.robustness:robustness", "other starts, samples and noise", long=True),

@@ -17,7 +17,7 @@ def door(n, loss, **settings):
 def test_a_sparse_jacobian_is_chosen_by_evidence():
     search = door(N, square(image(normal(1, N))[0]))
     assert search.engine == "descent"
-    assert "are to tell" in search.reason
+    assert "are to show" in search.reason
     run(search, image, 39)
     assert search.engine == "local"
     assert "100% of the change of held-out outputs, a dense one" in search.reason

@@ -148,7 +148,7 @@ def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
     search.tell(f(search.ask(limit=2)))
     assert search.done
     assert not search.solved
-    assert "do not tell" in search.message
+    assert "do not show" in search.message
 
 
 def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:

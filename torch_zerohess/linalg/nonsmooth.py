@@ -6,15 +6,13 @@ import torch
 from torch import Tensor
 
 Valued = Callable[[Tensor], tuple[float, Callable[[], Tensor]]]
-"""Maps [n] to a value and what computes a slope [n] there, which many points of a line search do not need."""
+"""Maps [n], float64, to a value and to a function that computes a slope [n] there. Many points of a line search need no
+slope."""
 
 _DECREASE, _SLOPE = 1e-4, 0.9
 """Part of the decrease that the slope promises, and part of the slope, of a line search: conditions of Wolfe."""
 _BISECTIONS = 30
 """Points of a line search at most."""
-_NOTHING = 1e-10
-"""Decrease over the value, beyond the nearer end of a bracket, that is not worth a point. The slope bounds it if the
-function is convex."""
 _LATEST = 10
 """Iterations whose decrease is compared with the whole decrease."""
 _ITERATIONS, _LEAST_GAIN, _BESIDE = 1000, 1e-6, 0.01
@@ -34,7 +32,7 @@ def kinked_minimum(
     curvature. The function need not be convex. Convergence is not proven.
 
     Args:
-        function: float64.
+        function: returns a value and the function of its slope.
         start: its value is finite.
         iterations: at most.
         radius: length of the first step that is tried. The path depends on it, and on no scale of the function.
@@ -61,8 +59,6 @@ def kinked_minimum(
             elif float((turned := slope_there()) @ direction) < _SLOPE * down:
                 low = length
             else:
-                break
-            if -down * (high - low) <= _NOTHING * abs(value):
                 break
             length = 2.0 * low if high == float("inf") else 0.5 * (low + high)
         if not now < value:

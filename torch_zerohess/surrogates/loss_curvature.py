@@ -66,9 +66,9 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
 
 
 def value_then_slope(loss: Callable[[Tensor], Tensor], output: Tensor) -> tuple[float, Callable[[], Tensor]]:
-    """Return the loss at an output [*out], float64, and what computes its slope [*out]; numbers as in `loss_curvature`.
+    """Return the loss at an output [*out], float64, and the function of its slope [*out]. Numbers as `loss_curvature`.
 
-    The slope takes several times the time of the value.
+    The slope takes several times as long as the value.
     """
     with torch.enable_grad():
         y = output.detach().requires_grad_(True)

@@ -5,6 +5,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+Valued = Callable[[Tensor], tuple[float, Callable[[], Tensor]]]
+"""Maps [n], float64, to a value and to a function that computes a slope [n] there. Many points of a line search need no
+slope."""
+
 _DECREASE, _SLOPE = 1e-4, 0.9
 """Part of the decrease that the slope promises, and part of the slope, of a line search: conditions of Wolfe."""
 _BISECTIONS = 30
@@ -16,7 +20,7 @@ _ITERATIONS, _LEAST_GAIN, _BESIDE = 1000, 1e-6, 0.01
 
 
 def kinked_minimum(
-    function: Callable[[Tensor], tuple[float, Tensor]],
+    function: Valued,
     start: Tensor,
     iterations: int,
     radius: float,
@@ -28,7 +32,7 @@ def kinked_minimum(
     curvature. The function need not be convex. Convergence is not proven.
 
     Args:
-        function: maps [n] to its value and a slope [n], float64.
+        function: returns a value and the function of its slope.
         start: its value is finite.
         iterations: at most.
         radius: length of the first step that is tried. The path depends on it, and on no scale of the function.
@@ -36,7 +40,8 @@ def kinked_minimum(
 
     Source: Lewis and Overton (2013), "Nonsmooth optimization via quasi-Newton methods".
     """
-    value, slope = function(start)
+    value, slope_there = function(start)
+    slope = slope_there()
     x, one = start, torch.eye(len(start), dtype=start.dtype, device=start.device)
     inverse = one * (radius / (float(slope.norm()) or 1.0))
     values = [value]
@@ -48,16 +53,17 @@ def kinked_minimum(
         low, high, length = 0.0, float("inf"), 1.0
         for _ in range(_BISECTIONS):
             new = x + length * direction
-            now, turned = function(new)
+            (now, slope_there), turned = function(new), None
             if not now <= value + _DECREASE * length * down:
                 high = length
-            elif float(turned @ direction) < _SLOPE * down:
+            elif float((turned := slope_there()) @ direction) < _SLOPE * down:
                 low = length
             else:
                 break
             length = 2.0 * low if high == float("inf") else 0.5 * (low + high)
         if not now < value:
             break
+        turned = slope_there() if turned is None else turned
         step, change = new - x, turned - slope
         x, value, slope = new, now, turned
         values.append(value)
@@ -74,7 +80,7 @@ def kinked_minimum(
 
 
 def bounded_kinked_minimum(
-    function: Callable[[Tensor], tuple[float, Tensor]],
+    function: Valued,
     start: Tensor,
     lower: Tensor,
     upper: Tensor,
@@ -97,10 +103,10 @@ def bounded_kinked_minimum(
         least_gain: decrease, over the value at the lowest point, of a try after which no other one follows.
     """
 
-    def folded(x: Tensor) -> tuple[float, Tensor]:
+    def folded(x: Tensor) -> tuple[float, Callable[[], Tensor]]:
         inside, signs = mirrored(x, lower, upper)
         value, slope = function(inside)
-        return value, signs * slope
+        return value, lambda: signs * slope()
 
     generator, best = torch.Generator(device="cpu").manual_seed(0), start
     lowest = function(start)[0]
@@ -127,6 +133,8 @@ def mirrored(x: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         lower: finite [n], below `upper`.
         upper: finite [n].
     """
+    if bool((x == x.clamp(lower, upper)).all()):
+        return x, torch.ones_like(x)
     width = upper - lower
     along = (x - lower).remainder(2.0 * width)
     back = along > width

@@ -65,13 +65,21 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
     return LossCurvature(float(value.detach()), fixed, product)
 
 
-def value_and_slope(loss: Callable[[Tensor], Tensor], output: Tensor) -> tuple[float, Tensor]:
-    """Return the loss at an output [*out], float64, and its slope [*out]; numbers as in `loss_curvature`."""
+def value_then_slope(loss: Callable[[Tensor], Tensor], output: Tensor) -> tuple[float, Callable[[], Tensor]]:
+    """Return the loss at an output [*out], float64, and the function of its slope [*out]. Numbers as `loss_curvature`.
+
+    The slope takes several times as long as the value.
+    """
     with torch.enable_grad():
         y = output.detach().requires_grad_(True)
         value = loss(y)
-        (slope,) = torch.autograd.grad(value, y)
-    return float(value.detach()), _finite(slope)
+    return float(value.detach()), lambda: _finite(torch.autograd.grad(value, y)[0])
+
+
+def value_and_slope(loss: Callable[[Tensor], Tensor], output: Tensor) -> tuple[float, Tensor]:
+    """Return the loss at an output [*out], float64, and its slope [*out]; numbers as in `loss_curvature`."""
+    value, slope = value_then_slope(loss, output)
+    return value, slope()
 
 
 def alternating(output: Tensor) -> Tensor:

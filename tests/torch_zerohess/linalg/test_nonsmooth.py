@@ -14,7 +14,7 @@ def minimum(f, iterations=100, radius=1.0, least_gain=0.0):
     def with_slope(x):
         x = x.clone().requires_grad_(True)
         value = f(x)
-        return float(value.detach()), torch.autograd.grad(value, x)[0]
+        return float(value.detach()), lambda: torch.autograd.grad(value, x)[0]
 
     return kinked_minimum(with_slope, torch.full((4,), 2.0, dtype=torch.float64), iterations, radius, least_gain)
 
@@ -79,7 +79,8 @@ def test_mirrored_points_are_in_the_box_and_signs_are_derivatives() -> None:
     after, _ = mirrored(x + 1e-7, lower, upper)
     assert bool(((at >= lower) & (at <= upper)).all())
     torch.testing.assert_close((after - at) / 1e-7, signs, rtol=0.0, atol=1e-6)
-    assert torch.equal(mirrored(0.1 * upper, lower, upper)[0], 0.1 * upper)
+    partly = vector(5.0, 0.05, 0.3)
+    assert torch.equal(mirrored(partly, lower, upper)[0][1:], partly[1:])
 
 
 def test_a_minimum_on_the_side_of_a_box_is_found_by_reflection() -> None:
@@ -96,7 +97,7 @@ def test_the_lowest_sum_of_distances_in_a_box_is_at_the_nearest_points_to_the_me
     median, lower, upper = PLACES.median(0).values, vector(-1.0, -1.0, 0.5, 0.3), vector(-0.4, 1.0, 2.0, 2.0)
 
     def distances(x):
-        return float((x - PLACES).abs().sum()), (x - PLACES).sign().sum(0)
+        return float((x - PLACES).abs().sum()), lambda: (x - PLACES).sign().sum(0)
 
     found = nonsmooth.bounded_kinked_minimum(distances, vector(-0.5, 0.0, 1.5, 1.0), lower, upper, 1.0, 4, 1e-8)
     torch.testing.assert_close(found, median.clamp(lower, upper), rtol=0.0, atol=1e-5)
@@ -108,8 +109,27 @@ def test_a_slope_that_points_to_no_decrease_where_kinks_meet_does_not_end_a_sear
     def pieces(x):
         each = torch.stack([x[0] - 2.0 * x[1], 2.0 * x[1] + x[0]])
         k = int(each.argmax())
-        return float(each[k]), vector(1.0, -2.0 if k == 0 else 2.0)
+        return float(each[k]), lambda: vector(1.0, -2.0 if k == 0 else 2.0)
 
     start, one = vector(0.9, 0.0), vector(1.0, 1.0)
     found = nonsmooth.bounded_kinked_minimum(pieces, start, -one, one, 1.0, 4, 1e-8)
     assert pieces(found)[0] == pytest.approx(-1.0, abs=1e-5)
+
+
+def test_a_point_of_a_line_search_that_is_too_high_needs_no_slope() -> None:
+    """From 1 the first step of |x - 2| has length 3 and ends at 4, which is higher. All later points are lower."""
+    values, slopes = [], 0
+
+    def kinked(x):
+        values.append(float((x - 2.0).abs().sum()))
+
+        def slope():
+            nonlocal slopes
+            slopes += 1
+            return (x - 2.0).sign()
+
+        return values[-1], slope
+
+    kinked_minimum(kinked, vector(1.0), 20, 3.0)
+    assert values[:3] == [1.0, 2.0, 0.5]
+    assert slopes == len(values) - 1

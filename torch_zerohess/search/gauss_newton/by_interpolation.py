@@ -19,6 +19,7 @@ Wild (2019), "Derivative-free optimization methods", for composite losses with k
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,7 +34,7 @@ from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 from torch_zerohess.search.region.method import BAD, LONG, NEAR, RegionDescent
 from torch_zerohess.search.region.progress import RegionProgress
 from torch_zerohess.surrogates.least_change import LeastNorm
-from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
+from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_then_slope
 from torch_zerohess.surrogates.pool import Pool, latest
 from torch_zerohess.surrogates.quadratic import coefficients
 
@@ -202,13 +203,13 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         lower, upper = ((one - x).clamp(-2.0 * radius, 2.0 * radius) for one in (settings.lower, settings.upper))
         steep = _STEEP * known.size * max(float(known.gradient.norm()), math.ulp(0.0))
 
-        def penalised(s: Tensor) -> tuple[float, Tensor]:
+        def penalised(s: Tensor) -> tuple[float, Callable[[], Tensor]]:
             inside, signs = mirrored(s, lower, upper)
             value, slope = self._of_linear(known, curvature, inside)
             length = float(inside.norm())
-            if length > radius:
-                value, slope = value + steep * (length - radius), slope + steep * inside / length
-            return value, signs * slope
+            if length <= radius:
+                return value, lambda: signs * slope()
+            return value + steep * (length - radius), lambda: signs * (slope() + steep * inside / length)
 
         def lowest(start: Tensor, iterations: int, least_gain: float) -> Tensor:
             t, _ = mirrored(kinked_minimum(penalised, start, iterations, radius, least_gain), lower, upper)
@@ -226,13 +227,13 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
             t = min(t, end, key=lambda one: self._of_linear(known, curvature, one)[0])
         return t, before - self._of_linear(known, curvature, t)[0]
 
-    def _of_linear(self, known: OutputProgress, curvature: Tensor, s: Tensor) -> tuple[float, Tensor]:
-        """Return the loss of the linear outputs at a step [n], with the curvature of the outputs, and its slope."""
+    def _of_linear(self, known: OutputProgress, curvature: Tensor, s: Tensor) -> tuple[float, Callable[[], Tensor]]:
+        """Return the loss of the linear outputs at a step [n], with the curvature of the outputs; then its slope."""
         assert self._linear is not None
         output, jacobian = self._linear
-        loss, slope = value_and_slope(self.settings.white_box, (output + s @ jacobian).view(known.shape))
+        loss, slope = value_then_slope(self.settings.white_box, (output + s @ jacobian).view(known.shape))
         bent = curvature @ s
-        return loss + 0.5 * float(s @ bent), jacobian @ slope.flatten() + bent
+        return loss + 0.5 * float(s @ bent), lambda: jacobian @ slope().flatten() + bent
 
     def _on_plateau(self, known: OutputProgress, generator: torch.Generator) -> tuple[OutputProgress, Tensor]:
         return replace(known, failed=True), known.points[:0]

@@ -23,7 +23,7 @@ from torch_zerohess.search.gauss_newton.kinked_steps import (
     linear_outputs,
     shortened,
 )
-from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature
+from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature, value_then_slope
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _ITERATIONS = 100
@@ -94,9 +94,9 @@ def thorough_step(
         end, promised = smoothed_minimum(outputs, widths, longest, lower, upper, start)
         return Steps(end[None], promised)
 
-    def function(s: Tensor) -> tuple[float, Tensor]:
-        value, slope = outputs.loss(outputs.output + outputs.matvec(s))
-        return value, outputs.rmatvec(slope)
+    def function(s: Tensor) -> tuple[float, Callable[[], Tensor]]:
+        value, slope = value_then_slope(loss, (outputs.output + outputs.matvec(s)).view(output.shape))
+        return value, lambda: outputs.rmatvec(slope().flatten())
 
     lower, upper = (one.clamp(-longest, longest) for one in (lower, upper))
     end = shortened(bounded_kinked_minimum(function, start, lower, upper, longest, _TRIES, NOTHING), longest)

@@ -39,12 +39,13 @@ def region_step(
     lower: Tensor,
     upper: Tensor,
     singular: float = SINGULAR,
-    border: Tensor | None = None,
+    borders: Tensor | None = None,
 ) -> Tensor:
     """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
 
-    The constraint that is exceeded most becomes an equation, and the rest of s gets a new step, until none is exceeded.
-    The set of active constraints may not be optimal.
+    s moves from 0 to the minimum under the constraints that hold as equations. On its way the first further constraint
+    becomes an equation. At the minimum the equation with the most negative multiplier is given up, as long as this
+    lowers the quadratic. If the Hessian is not positive, the set of equations may not be optimal.
 
     Args:
         gradient: [n].
@@ -53,22 +54,40 @@ def region_step(
         lower: [n], at most 0.
         upper: [n], at least 0.
         singular: curvature in B s, relative to the largest one, that may as well be zero.
-        border: a and b [n + 1]; s has a.s <= b, too, b at least 0.
+        borders: rows of a and b [m, n + 1]; s has a.s <= b for each, too, b at least 0.
     """
     rows, most = torch.cat([root, -root]), torch.cat([upper, -lower])
-    if border is not None:
-        rows, most = torch.cat([border[None, :-1] @ root, rows]), torch.cat([border[-1:], most])
+    if borders is not None:
+        rows, most = torch.cat([borders[:, :-1] @ root, rows]), torch.cat([borders[:, -1], most])
     length = rows.norm(dim=1)
     rows, most = (rows / length[:, None])[most.isfinite()], (most / length)[most.isfinite()]
     gradient, hessian = root.mT @ gradient, root.mT @ hessian @ root
-    u, equations = ball_step(gradient, hessian, 1.0, singular), torch.zeros_like(most, dtype=torch.bool)
-    while bool((beyond := torch.where(equations, -1.0, rows @ u - most)).gt(_BEYOND).any()):
-        equations[int(beyond.argmax())] = True
-        u = torch.linalg.pinv(rows[equations]) @ most[equations]  # the nearest point to the center of the region
-        left = 1.0 - float(u @ u)
-        if int(equations.sum()) >= len(u) or left <= 0.0:
-            u = u / max(1.0, float(u.norm()))
+    u, held = torch.zeros_like(gradient), torch.zeros_like(most, dtype=torch.bool)
+    lowest, least = u, torch.inf
+    while True:
+        across, sizes, along = torch.linalg.svd(rows[held])
+        count = len(sizes)
+        end = along[:count].mT @ (across[:, :count].mT @ most[held] / sizes)  # the nearest point to the region's center
+        free, left = along[count:].mT, 1.0 - float(end @ end)
+        if free.shape[1] and left > 0.0:
+            slope, bend = free.mT @ (gradient + hessian @ end), free.mT @ hessian @ free
+            end = end + free @ ball_step(slope, bend, left**0.5, singular)
+        ahead = torch.where(held, 0.0, rows @ (end - u))
+        part = torch.where(ahead > _BEYOND, (most - rows @ u).clamp_min(0.0) / ahead, torch.inf)
+        if bool((part < 1.0).any()):
+            u = u + part.min() * (end - u)
+            held[int(part.argmin())] = True
+            continue
+        u, slope = end, gradient + hessian @ end
+        value = 0.5 * float((gradient + slope) @ u)
+        if value >= least:  # without convexity, equations may come and go
             break
-        free = torch.linalg.svd(rows[equations])[2][int(equations.sum()) :].mT
-        u = u + free @ ball_step(free.mT @ (gradient + hessian @ u), free.mT @ hessian @ free, left**0.5, singular)
-    return (root @ u).clamp(lower, upper)
+        lowest, least = u, value
+        if not bool(held.any()):
+            break
+        forces = rows[held] if float(u.norm()) < 1.0 - _BEYOND else torch.cat([rows[held], u[None]])
+        multipliers = -(torch.linalg.pinv(forces.mT) @ slope)[: int(held.sum())]
+        if float(multipliers.min()) >= 0.0:
+            break
+        held[held.nonzero()[int(multipliers.argmin()), 0]] = False
+    return (root @ lowest).clamp(lower, upper)

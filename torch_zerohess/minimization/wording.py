@@ -48,6 +48,8 @@ def worded(
         message += f"; noise was not measured: give noise, or max_evaluations of at least {measuring}"
     if failed:
         message += f"; values or outputs that are not finite, and were left out: {failed}"
+        if status == "stalled":
+            message += "; let fn return a loss that grows with the violation, or outputs, with a penalty in loss="
     return message + _on_untouched(untouched)
 
 

@@ -34,15 +34,19 @@ def test_curvature_below_the_floor_is_taken_as_the_floor():
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("border", [None, vector(1.0, -1.0, 0.5, 0.1)], ids=["", "beside a border"])
-def test_a_step_in_a_box_is_as_low_as_any_of_many_points(seed, border):
+@pytest.mark.parametrize(
+    "borders",
+    [None, vector(1.0, -1.0, 0.5, 0.1)[None], vector(1.0, -1.0, 0.5, 0.1, -1.0, 0.5, 1.0, 0.05).view(2, 4)],
+    ids=["", "beside a border", "in a corner"],
+)
+def test_a_step_in_a_box_is_as_low_as_any_of_many_points(seed, borders):
     generator = torch.Generator().manual_seed(seed)
     root, H = rotated([0.5, 1.0, 2.0], seed), rotated([-1.0, 0.5, 3.0], seed + 10)
     g = torch.randn(3, generator=generator, dtype=torch.float64)
     lower, upper = vector(-0.3, -2.0, -0.1), vector(0.5, 0.2, 2.0)
-    s = region_step(g, H, root, lower, upper, border=border)  # the active set is a guess: within 5 %
+    s = region_step(g, H, root, lower, upper, borders=borders)  # the active set is a guess: within 5 %
     assert bool(((s >= lower) & (s <= upper)).all())
-    assert border is None or float(border[:-1] @ s) <= float(border[-1]) + 1e-9
+    assert borders is None or bool((borders[:, :-1] @ s <= borders[:, -1] + 1e-9).all())
 
     def model(z):
         return z @ g + 0.5 * ((z @ H) * z).sum(-1)
@@ -50,9 +54,17 @@ def test_a_step_in_a_box_is_as_low_as_any_of_many_points(seed, border):
     u = torch.randn(20_000, 3, generator=generator, dtype=torch.float64)
     every = (torch.rand(20_000, 1, generator=generator) ** 0.3 * u / u.norm(dim=1, keepdim=True)) @ root
     inside = ((every >= lower) & (every <= upper)).all(1)
-    if border is not None:
-        inside &= every @ border[:-1] <= border[-1]
+    if borders is not None:
+        inside &= (every @ borders[:, :-1].mT <= borders[:, -1]).all(1)
     assert float(model(s)) < 0.95 * float(model(every[inside]).min())
+
+
+def test_a_step_gives_up_a_bound_that_does_not_hold_it():
+    """|s - (1.7, 1.9)|^2/2 is least at (0.1, 0.7) on 0.8 x + 0.6 y = 0.5. On the way from 0, x <= 0.3 is met first."""
+    lower, upper = vector(-torch.inf, -torch.inf), vector(0.3, torch.inf)
+    one = torch.eye(2, dtype=torch.float64)
+    s = region_step(vector(-1.7, -1.9), one, 4.0 * one, lower, upper, borders=vector(0.8, 0.6, 0.5)[None])
+    torch.testing.assert_close(s, vector(0.1, 0.7))
 
 
 def test_without_bounds_in_the_way_it_is_the_step_of_the_ball():

@@ -25,3 +25,12 @@ def test_a_minimum_that_may_not_be_unique_is_said_once():
     assert said(known) == known
     assert said("reached", "target") == "reached"
     assert said("used up", "callback", success=False) == "used up"
+
+
+def test_after_failures_a_search_that_stalled_says_what_fn_may_return_instead():
+    def said(status, failed):
+        return worded("ended", status, 0, "", None, arrived=False, success=False, failed=failed)
+
+    advice = "; let fn return a loss that grows with the violation, or outputs, with a penalty in loss="
+    assert said("stalled", 3) == said("budget", 3) + advice
+    assert "violation" not in said("budget", 3) + said("stalled", 0)

@@ -76,7 +76,7 @@ class ProcessMethod(Method[Q]):
             iterations=known.iterations + trial,
         )
         before = known.best.point
-        if known.lost >= LOST:
+        if self.gives_up(known):
             return known.ended_round(not_finite(known.lost), 0)
         known = self.remembered(known, evaluated.those(finite))
         known = self.avoiding(known, evaluated.points[~finite])
@@ -84,6 +84,10 @@ class ProcessMethod(Method[Q]):
             known = replace(known, moved=max(known.moved, self._length(known.best.point - before)))
         known = self._settled(known) if trial else known
         return replace(known, center=evaluated.needed.points[-1], phase="trial")
+
+    def gives_up(self, known: Q) -> bool:
+        """Whether so many batches in a row were lost that the search ends."""
+        return known.lost >= LOST
 
     def points(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
         """Return the progress, with the noise that the process found, and the next points [K, n]."""

@@ -21,7 +21,7 @@ from torch_zerohess.search.gaussian_process.finish import PATIENCE, FinishedProc
 from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import fractions, uniform
-from torch_zerohess.search.protocol.state import Evaluated
+from torch_zerohess.search.protocol.state import LOST, Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
 _NEAR = 0.1
@@ -94,6 +94,10 @@ class LossProcess(FinishedProcess[LossProgress]):
             return self._axes.more(known.lines, count)
         return super().more(known, points, count, generator)
 
+    def gives_up(self, known: LossProgress) -> bool:
+        """Quadratics go on where there are values: one alone may be all that there is."""
+        return super().gives_up(known) and len(known.pool) < 2
+
     def points(self, known: LossProgress, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
         known, points = super().points(known, generator)
         return replace(known, foretold=self._foretold(known, points)), points
@@ -120,11 +124,11 @@ class LossProcess(FinishedProcess[LossProgress]):
             waited=0 if known.best.loss < before else known.waited + count,
         )
         turn = known.steps >= _STEPS or known.waited >= PATIENCE * (self.settings.n + 1)
-        turn = turn or (foretold and self.is_new(known))
+        turn = turn or known.lost >= LOST or (foretold and self.is_new(known))
         if not turn or known.noisy or known.done:
             return known, evaluated.points[:0]
         if self.is_new(known):
-            begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
+            begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH).avoiding(known.holes)
             return _finishing(known, *self.local.plan(begun, generator))
         if self._axes.may_begin(known.lines, several=known.several):
             lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values)
@@ -173,10 +177,12 @@ class LossProcess(FinishedProcess[LossProgress]):
         best = known.best
         plateau = now.wide is not None  # the process leaves it sooner
         looks = now.slopes is not None or now.phase == "aside"  # around where they may have arrived
+        looks = looks or now.border is not None  # steps beside a border fail half of the time
         patient = looks or known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
-        converged = now.done and now.arrivals.lowest is not None
+        # The end beside a border is no minimum: no evaluation may have told how the border goes on.
+        converged = now.done and now.arrivals.lowest is not None and now.border is None
         if best is now.best:
             known = replace(known, finished=best.point, solved=best.point if converged else None)
         known = replace(known, finishing=False, waited=0)
@@ -195,4 +201,4 @@ def _finishing(
     known: LossProgress, quadratics: MetricProgress, points: Tensor, *, beside: bool = False
 ) -> tuple[LossProgress, Tensor]:
     """Return the progress when quadratics have begun, and their points."""
-    return replace(known, local=quadratics, finishing=True, beside=beside, steps=0, waited=0), points
+    return replace(known, local=quadratics, finishing=True, beside=beside, steps=0, waited=0, lost=0), points

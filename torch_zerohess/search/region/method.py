@@ -17,7 +17,7 @@ from torch_zerohess.linalg.subproblem import SINGULAR
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import fractions, normal
 from torch_zerohess.search.protocol.state import Best, Evaluated, not_finite
-from torch_zerohess.search.region.border import border_between
+from torch_zerohess.search.region.border import borders_between
 from torch_zerohess.search.region.progress import R, RegionProgress
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
@@ -260,12 +260,12 @@ class RegionDescent(Method[R]):
 
     def _bordered(self, known: R) -> tuple[R, bool]:
         """Return the progress with the border that is near, if there is one, and whether the border is plane."""
-        found = border_between(known.scaled, known.holes) if bool(known.holes.any()) else None
+        found = borders_between(known.scaled, known.holes) if bool(known.holes.any()) else None
         if found is None:
             return replace(known, border=None, cuts=replace(known.cuts, last="whole")), False
-        normal, offset, plane = found
-        normal = torch.linalg.solve(known.root, normal) / known.sigma  # B is symmetric
-        return replace(known, border=torch.cat([normal, normal.new_tensor([offset])])), plane
+        planes, whole = found
+        normals = torch.linalg.solve(known.root, planes[:, :-1].mT).mT / known.sigma  # B is symmetric
+        return replace(known, border=torch.cat([normals, planes[:, -1:]], 1)), whole
 
     def _outside(self, known: R) -> R:
         """Shrink sigma after points without a finite value; less if the end of a step was beyond a border."""
@@ -278,7 +278,7 @@ class RegionDescent(Method[R]):
         """Ask for a point of the region in a direction u [n] or its opposite."""
         step = known.sigma * (known.root @ direction)
         step = -step if float(fractions(generator)) < 0.5 else step
-        if known.border is not None and float(known.border[:-1] @ step) > float(known.border[-1]):
+        if known.border is not None and bool((known.border[:, :-1] @ step > known.border[:, -1]).any()):
             step = -step
         x = self.settings.inside((known.lowest.point + step)[None])
         return replace(known, phase="geometry", expected=self._expected(known, x[0])), x

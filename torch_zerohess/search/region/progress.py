@@ -28,7 +28,7 @@ class RegionProgress(Progress):
     holes: Tensor
     """Which of the evaluations [P] have no finite value. Their entry of `values` is the highest one of the round."""
     border: Tensor | None = None
-    """a and b [n + 1] of a plane a.s = b, s from the best point. The holes near that point are at a.s > b."""
+    """Rows of a and b [m, n + 1] of planes a.s = b, s from the best point. Each hole near it has a.s > b for one."""
     cuts: CutSteps = field(default_factory=CutSteps)
     """Steps that the border has cut short."""
     root: Tensor
@@ -84,6 +84,12 @@ class RegionProgress(Progress):
         """Return a round with other evaluations [P, n] and finite values [P]."""
         return replace(self, points=points, values=values, holes=torch.zeros_like(values, dtype=torch.bool), **own)
 
+    def avoiding(self: R, points: Tensor) -> R:
+        """Add points [K, n] without a finite value to a round with evaluations."""
+        values = torch.cat([self.values, self.values.max().expand(len(points))])
+        holes = torch.cat([self.holes, self.holes.new_ones(len(points))])
+        return replace(self, points=torch.cat([self.points, points]), values=values, holes=holes)
+
     def remembered(self: R, evaluated: Evaluated, capacity: int) -> R:
         """Add evaluations; a value that is not finite counts as the highest one of the round."""
         finite = evaluated.finite
@@ -91,17 +97,16 @@ class RegionProgress(Progress):
         lowest = self.lowest.or_lower(new, self.sigma)
         points, values = torch.cat([self.points, new.points]), torch.cat([self.values, new.losses])
         holes = torch.cat([self.holes, torch.zeros_like(new.losses, dtype=torch.bool)])
-        if len(values) and len(new) < len(evaluated):
-            failed = evaluated.points[~finite]
-            points, values = torch.cat([points, failed]), torch.cat([values, values.max().expand(len(failed))])
-            holes = torch.cat([holes, holes.new_ones(len(failed))])
-        which = latest(points, lowest.point, capacity)
-        return replace(
+        known = replace(
             self.told(evaluated, lost=evaluated.lacking),
             best=self.best.or_lower(new, self.sigma),
             lowest=lowest,
             center=lowest.point,
-            points=points[which],
-            values=values[which],
-            holes=holes[which],
+            points=points,
+            values=values,
+            holes=holes,
         )
+        if len(values):
+            known = known.avoiding(evaluated.points[~finite])
+        which = latest(known.points, lowest.point, capacity)
+        return replace(known, points=known.points[which], values=known.values[which], holes=known.holes[which])

@@ -5,36 +5,50 @@ import pytest
 import torch
 
 import torch_zerohess as zh
-from torch_zerohess.search.region.border import border_between
+from torch_zerohess.search.region.border import borders_between
 from torch_zerohess.search.region.cut_steps import CutSteps
 
 
 def test_the_plane_lies_in_the_middle_between_evaluations_and_holes():
     u = torch.tensor([[0.0, 0.0], [0.0, 1.0], [-1.0, 0.5], [0.4, 0.5], [0.4, -1.0]], dtype=torch.float64)
-    found = border_between(u, torch.tensor([False, False, False, True, True]))
+    found = borders_between(u, torch.tensor([False, False, False, True, True]))
     assert found is not None
-    normal, offset, plane = found
-    torch.testing.assert_close(normal, torch.tensor([1.0, 0.0], dtype=torch.float64))
-    assert (offset, plane) == (pytest.approx(0.2), True)
+    planes, whole = found
+    torch.testing.assert_close(planes, torch.tensor([[1.0, 0.0, 0.2]], dtype=torch.float64))
+    assert whole
+
+
+def test_beside_a_corner_every_border_has_a_plane_nearer_to_the_evaluations():
+    """The holes are around the quadrant x <= 0.2, y <= 0.2. Together the planes have a value with probability 1/2."""
+    inside = torch.tensor([[0.0, 0.0], [0.0, -2.9], [-2.9, 0.0], [-0.5, -0.5]], dtype=torch.float64)
+    outside = torch.tensor([[0.4, -0.5], [-0.5, 0.4], [-2.0, 0.5], [0.6, -2.0]], dtype=torch.float64)
+    found = borders_between(torch.cat([inside, outside]), torch.tensor(4 * [False] + 4 * [True]))
+    assert found is not None
+    planes, whole = found
+    offset = 0.4 * (1.0 - 0.5**0.5)
+    torch.testing.assert_close(planes, torch.tensor([[1.0, 0.0, offset], [0.0, 1.0, offset]], dtype=torch.float64))
+    assert whole
 
 
 def test_where_the_border_is_curved_only_what_is_near_counts():
-    """Holes outside of a parabola and on its axis: no plane has all of them on one side, but one has those near by."""
+    """Holes outside of a parabola, and one among evaluations: planes separate only those near by."""
     inside = torch.tensor([[0.0, 0.0], [0.0, -0.5], [2.0, -2.0], [-2.0, -2.0]], dtype=torch.float64)
-    outside = torch.tensor([[0.0, 0.2], [1.0, 0.2], [0.0, -2.5]], dtype=torch.float64)
-    found = border_between(torch.cat([inside, outside]), torch.tensor(4 * [False] + 3 * [True]))
+    outside = torch.tensor([[0.0, 0.2], [1.0, 0.2], [0.0, -1.5]], dtype=torch.float64)
+    found = borders_between(torch.cat([inside, outside]), torch.tensor(4 * [False] + 3 * [True]))
     assert found is not None
-    normal, offset, plane = found
-    assert (outside[:2] @ normal).min() > offset > 0.0
-    assert not plane
+    planes, whole = found
+    beyond = outside[:2] @ planes[:, :-1].mT > planes[:, -1]
+    assert bool(beyond.any(1).all())
+    assert bool((planes[:, -1] > 0.0).all())
+    assert not whole
 
 
 def test_without_holes_near_by_or_with_holes_all_around_there_is_no_border():
     u = torch.tensor([[0.0, 0.0], [9.0, 0.0]], dtype=torch.float64)
-    assert border_between(u, torch.tensor([False, True])) is None
+    assert borders_between(u, torch.tensor([False, True])) is None
     angles = torch.arange(7, dtype=torch.float64)
     around = torch.cat([torch.zeros(1, 2, dtype=torch.float64), torch.stack([angles.cos(), angles.sin()], 1)])
-    assert border_between(around, torch.tensor([False] + 7 * [True])) is None
+    assert borders_between(around, torch.tensor([False] + 7 * [True])) is None
 
 
 def plane(n, generator):
@@ -77,6 +91,31 @@ def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
         assert fit.value >= least * (1.0 - 1e-9)
         found += fit.value <= near
     assert found >= 3
+
+
+@pytest.mark.parametrize("bounds", [None, (-1.0, 3.0)], ids=["descent", "gaussian_process"])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_minimum_in_a_corner_is_found(seed, bounds):
+    """2 x + y where x + y >= 1 and x - 2 y >= -1 has its minimum 4/3 at (1/3, 2/3)."""
+
+    def fn(z):
+        allowed = (z.sum(1) >= 1.0) & (z[:, 0] - 2.0 * z[:, 1] >= -1.0)
+        return torch.where(allowed, 2.0 * z[:, 0] + z[:, 1], torch.nan)
+
+    fit = zh.minimize(fn, [2.0, 1.0], sigma=1.0, bounds=bounds, seed=seed, max_evaluations=200)
+    assert fit.evaluations == 200
+    assert 4.0 / 3.0 <= fit.value < 4.0 / 3.0 + 1e-3
+
+
+def test_with_bounds_evaluations_that_fail_do_not_end_the_search():
+    """Nine of ten points of the box fail."""
+
+    def fn(z):
+        return torch.where(z[:, 1] >= 2.0 + 0.1 * z[:, 0].square(), z[:, 1] - 0.5 * z[:, 0], torch.nan)
+
+    fit = zh.minimize(fn, [0.0, 2.3], sigma=1.0, bounds=(-3.0, 3.0), seed=0, max_evaluations=100)
+    assert fit.evaluations == 100
+    assert not fit.success
 
 
 @pytest.mark.parametrize(("n", "most"), [(3, 40), (5, 50)])

@@ -66,7 +66,7 @@ def region_step(
     lowest, least = u, torch.inf
     while True:
         across, sizes, along = torch.linalg.svd(rows[held])
-        count = len(sizes)
+        count, sizes = len(sizes), sizes.clamp_min(_BEYOND)  # rows may depend on each other
         end = along[:count].mT @ (across[:, :count].mT @ most[held] / sizes)  # the nearest point to the region's center
         free, left = along[count:].mT, 1.0 - float(end @ end)
         if free.shape[1] and left > 0.0:

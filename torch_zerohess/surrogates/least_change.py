@@ -22,11 +22,11 @@ from torch_zerohess.surrogates.quadratic import coefficients
 
 _EXACT = 1e-10
 """Variance of a value that is no quadratic, in units of the mean variance of the quadratics at the points."""
-_CUBIC, _ROUGH = 1e-8, 1e-2
+_CUBIC, _ROUGH = 1e-8, 1e-3
 """The same per sixth power of the distance: of a function that is nearly quadratic, and of another one. A smooth
 function leaves a quadratic by third powers."""
-_FEW = 0.75
-"""Values, over the coefficients of a quadratic, below which the rate is `_ROUGH`."""
+_FEW, _OF_FEW = 0.6, 1e-2
+"""Values, over the coefficients of a quadratic, below which they have no choice, and their rate."""
 _ALIKE = 1.0
 """Variance of the multiple of the identity, over the variance of an entry beside the diagonal."""
 _LIKELIER = 20.0
@@ -50,10 +50,11 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
     likelihood of the values says so.
     """
     rest = values - 0.5 * ((u @ hessian) * u).sum(1)
-    fit = _Affine.through(u, values, rest, _ROUGH)
-    if len(u) >= _FEW * coefficients(u.shape[1]):
-        smooth = _Affine.through(u, values, rest, _CUBIC)
-        fit = fit if fit.likelihood > smooth.likelihood + math.log(_LIKELIER) else smooth
+    if len(u) < _FEW * coefficients(u.shape[1]):
+        fit = _Affine.through(u, values, rest, _OF_FEW)
+    else:
+        smooth, rough = (_Affine.through(u, values, rest, rate) for rate in (_CUBIC, _ROUGH))
+        fit = rough if rough.likelihood > smooth.likelihood + math.log(_LIKELIER) else smooth
     alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
     change = (u.mT * alpha) @ u
     change.diagonal().add_(0.5 * _ALIKE * float(alpha @ u.square().sum(1)))

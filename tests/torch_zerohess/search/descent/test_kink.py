@@ -187,7 +187,7 @@ def test_a_smooth_function_is_not_searched_for_kinks() -> None:
 
 
 def valley(z: Tensor) -> Tensor:
-    return (z - 0.3).square() @ torch.tensor([1.0, 1e7]).double()
+    return (z - 0.3).square() @ torch.tensor([1.0, 1e6]).double()
 
 
 def step(z: Tensor) -> Tensor:

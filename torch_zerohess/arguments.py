@@ -154,7 +154,7 @@ def _numbers(given: Any) -> Tensor:
 
 
 def own_copy(numbers: Any) -> Any:
-    """Return a copy of an array, whose strides torch can take: NumPy has negative ones. Anything else as it is."""
+    """Return a copy of an array with positive strides, which torch needs; return anything else as it is."""
     return numbers.copy() if hasattr(numbers, "strides") else numbers
 
 

@@ -28,9 +28,8 @@ class SparseBlackBox(Layer):
     parameters each output depends on, from the evaluations of the call and what earlier calls have found, see
     `sparse_jacobian`. Its derivatives have far less noise where Jacobians are sparse. They are biased by the entries
     that are not found, and useless where the Jacobian is dense. `jacobians[b].explained` should be near 1. Where each
-    of n outputs depends on one parameter, as behind a rounding, their error is below that of `BlackBox` from about
-    n = 4 on, and a fifth of it at n = 16. With fewer parameters, and tens of samples for each, `BlackBox` is the better
-    choice.
+    output depends on one parameter, as behind a rounding, their error is below the error of `BlackBox` from a few
+    parameters on. With two parameters, and tens of samples for each, `BlackBox` is the better choice.
 
     The layer is linear in x around the point of the call. So the second derivatives of a loss behind it are J^T H J,
     the Gauss-Newton matrix, with the Hessian H of the loss in the outputs.

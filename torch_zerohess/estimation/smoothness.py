@@ -219,7 +219,7 @@ def check_repeats(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> None:
 def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
     """Whether outputs differ where their derivative is zero; None if all outputs are equal.
 
-    z: the points [Q, n] of the outputs.
+    The outputs are those at points z [Q, n].
     """
     with torch.inference_mode(False), torch.enable_grad():
         at = z.clone().requires_grad_()

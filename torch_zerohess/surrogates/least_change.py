@@ -26,7 +26,8 @@ _CUBIC, _ROUGH = 1e-8, 1e-3
 """The same per sixth power of the distance: of a function that is nearly quadratic, and of another one. A smooth
 function leaves a quadratic by third powers."""
 _FEW, _OF_FEW = 0.6, 1e-2
-"""Values, over the coefficients of a quadratic, below which they have no choice, and their rate."""
+"""Fewer values than this, over the coefficients of a quadratic, get the rate that follows: their likelihood would
+nearly always choose `_CUBIC`."""
 _ALIKE = 1.0
 """Variance of the multiple of the identity, over the variance of an entry beside the diagonal."""
 _LIKELIER = 20.0

@@ -135,3 +135,8 @@ def test_few_points_tell_the_jacobian_along_them(P):
     u = torch.eye(4, dtype=torch.float64)[:P]
     expected = torch.cat([slopes[:P], torch.zeros(4 - P, 2, dtype=torch.float64)])
     torch.testing.assert_close(LeastNorm.through(u, u @ slopes).jacobian, expected, rtol=0, atol=1e-6)
+
+
+def test_where_all_points_round_to_the_center_the_jacobian_is_zero():
+    u = torch.zeros(3, 2, dtype=torch.float64)
+    assert not LeastNorm.through(u, u).jacobian.any()

@@ -95,7 +95,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         return super().more(known, points, count, generator)
 
     def gives_up(self, known: LossProgress) -> bool:
-        """Quadratics go on where there are values: one alone may be all that there is."""
+        """Whether it ends. It does only with less than two values: with more of them quadratics go on."""
         return super().gives_up(known) and len(known.pool) < 2
 
     def points(self, known: LossProgress, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
@@ -181,7 +181,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         patient = looks or known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
-        # The end beside a border is no minimum: no evaluation may have told how the border goes on.
+        # The end beside a border is no minimum: evaluations may not show how the border goes on.
         converged = now.done and now.arrivals.lowest is not None and now.border is None
         if best is now.best:
             known = replace(known, finished=best.point, solved=best.point if converged else None)

@@ -2,7 +2,7 @@
 
 A rendered task has fewer pixels, samples and bounces of light than the source (preset "paper"). Both settings are
 evaluated at the same points on the line from start 0 to the solution. Each loss has the reference of its own setting.
-The scale of a loss does not move its minimum, so the difference of the losses is also told after scaling.
+The scale of a loss does not move its minimum, so the table also has the difference of the losses after scaling.
 """
 
 import statistics

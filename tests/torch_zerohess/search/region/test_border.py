@@ -107,6 +107,27 @@ def test_a_minimum_in_a_corner_is_found(seed, bounds):
     assert 4.0 / 3.0 <= fit.value < 4.0 / 3.0 + 1e-3
 
 
+def test_quadratics_that_end_beside_a_border_have_found_no_minimum():
+    """In a corner of three borders. Evaluations on a bound may not show how a border goes on."""
+    weights = torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64)
+
+    def fn(z):
+        allowed = (z.sum(1) >= 1.0) & (z[:, 0] - z[:, 1] <= 0.5) & (z[:, 2] >= 0.2 * z[:, 0] + 0.1)
+        return torch.where(allowed, z @ weights, torch.nan)
+
+    start = torch.full((3,), 1.5, dtype=torch.float64)
+    search = zh.optim.TrustRegion(start, sigma=1.0, bounds=(0.0, 3.0), engine="gaussian_process", seed=2)
+    ended = 0
+    while search.evaluations < 100:
+        finishing = search._state.progress.finishing
+        search.tell(fn(search.ask()))
+        known = search._state.progress
+        if finishing and not known.finishing and known.local.done and known.local.border is not None:
+            ended += 1
+            assert known.solved is None
+    assert ended
+
+
 def test_with_bounds_evaluations_that_fail_do_not_end_the_search():
     """Nine of ten points of the box fail."""
 

@@ -5,11 +5,12 @@ interpolate the values. Powell's method takes the quadratic whose Hessian is nea
 Frobenius norm. It is unique once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic
 models"). It is the mean of a Gaussian process: the entries of the change of the Hessian are independent normal numbers.
 
-The process here differs in two ways. A multiple of the identity, with a normal factor, is added to the change: on the
-way to a minimum all curvatures often grow or fall alike. And a value at u differs from the quadratic by a normal number
-whose variance grows as |u|^6. How fast it grows depends on the function. Many values choose between two rates by their
-likelihoods (Rasmussen and Williams 2006, section 5.4). Few values get the faster rate: quadratics through far points
-fit them nearly always, and the slopes of these quadratics are wrong.
+The process here differs in three ways. On the way to a minimum all curvatures often grow or fall together. So a
+multiple of the identity is added, with a normal factor; beyond four parameters also a multiple of the earlier Hessian,
+as in self-scaling quasi-Newton methods (Oren and Luenberger 1974). And a value at u differs from the quadratic
+by a normal number whose variance grows as |u|^6. How fast it grows depends on the function. Many values choose between
+two rates by their likelihoods (Rasmussen and Williams 2006, section 5.4). Few values get the faster rate: quadratics
+through far points fit them nearly always, and the slopes of these quadratics are wrong.
 """
 
 import math
@@ -30,6 +31,10 @@ _FEW, _OF_FEW = 0.6, 1e-2
 nearly always choose `_CUBIC`."""
 _ALIKE = 1.0
 """Variance of the multiple of the identity, over the variance of an entry beside the diagonal."""
+_SCALED = 10.0
+"""Variance of the multiple of the earlier Hessian, which has the Frobenius norm of the identity here."""
+_TOLD = 4
+"""Parameters up to which the values soon tell all curvatures, and the earlier Hessian is not multiplied."""
 _LIKELIER = 20.0
 """`_ROUGH` is taken where it makes the values more than so many times as likely as `_CUBIC` does."""
 _FREE = 1e-12
@@ -50,14 +55,18 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
     result is a regression. Near points count more than far ones, and much more where the points are few or where the
     likelihood of the values says so.
     """
-    rest = values - 0.5 * ((u @ hessian) * u).sum(1)
-    if len(u) < _FEW * coefficients(u.shape[1]):
-        fit = _Affine.through(u, values, rest, _OF_FEW)
+    n = u.shape[1]
+    bend = ((u @ hessian) * u).sum(1)
+    rest = values - 0.5 * bend
+    scale = (_SCALED * n) ** 0.5 / (float(hessian.norm()) or 1.0) if n > _TOLD else 0.0
+    bend = scale * bend
+    if len(u) < _FEW * coefficients(n):
+        fit = _Affine.through(u, values, rest, bend, _OF_FEW)
     else:
-        smooth, rough = (_Affine.through(u, values, rest, rate) for rate in (_CUBIC, _ROUGH))
+        smooth, rough = (_Affine.through(u, values, rest, bend, rate) for rate in (_CUBIC, _ROUGH))
         fit = rough if rough.likelihood > smooth.likelihood + math.log(_LIKELIER) else smooth
     alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
-    change = (u.mT * alpha) @ u
+    change = (u.mT * alpha) @ u + 0.5 * float(alpha @ bend) * scale * hessian
     change.diagonal().add_(0.5 * _ALIKE * float(alpha @ u.square().sum(1)))
     return float(fit.coefficients[0]), fit.coefficients[1:], hessian + 0.5 * (change + change.mT)
 
@@ -76,10 +85,13 @@ class _Affine:
     """Logarithm of the restricted likelihood of the values, without an earlier Hessian, at the likeliest scale."""
 
     @classmethod
-    def through(cls, u: Tensor, values: Tensor, rest: Tensor, cubic: float) -> "_Affine":
-        """Fit values [P] at u [P, n], for the likelihood, and the `rest` of them less the earlier Hessian [P]."""
+    def through(cls, u: Tensor, values: Tensor, rest: Tensor, bend: Tensor, cubic: float) -> "_Affine":
+        """Fit values [P] at u [P, n], for the likelihood, and the `rest` of them less the earlier Hessian [P].
+
+        bend: u.H u [P] of a Hessian H whose multiple is added.
+        """
         P, n = u.shape
-        factor = _factor(u, cubic, _ALIKE)
+        factor = _factor(u, cubic, _ALIKE, bend)
         columns = torch.cat([u.new_ones(P, 1), u, rest[:, None], values[:, None]], 1)
         design, targets = torch.linalg.solve_triangular(factor, columns, upper=False).split([n + 1, 2], 1)
         free = (_FREE * float(design.square().sum(0).amax())) ** 0.5
@@ -125,11 +137,13 @@ class LeastNorm:
         return (self.u * alpha).mT @ self.u
 
 
-def _factor(u: Tensor, cubic: float, alike: float = 0.0) -> Tensor:
+def _factor(u: Tensor, cubic: float, alike: float = 0.0, bend: Tensor | None = None) -> Tensor:
     """Return the Cholesky factor of the covariance of values at u [P, n] whose slopes and constant are subtracted."""
     inner = u @ u.mT
     kernel, squares = 0.5 * inner.square(), inner.diagonal()
     unit = float(kernel.diagonal().mean()) or 1.0
     kernel.addr_(squares, squares, alpha=0.25 * alike)
+    if bend is not None:
+        kernel.addr_(bend, bend, alpha=0.25)
     kernel.diagonal().add_(_EXACT * unit + cubic * squares.pow(3))
     return torch.linalg.cholesky(kernel)

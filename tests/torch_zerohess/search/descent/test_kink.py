@@ -1,7 +1,7 @@
 """Descent on a loss with kinks."""
 
-from dataclasses import statistics
-import replace
+import statistics
+from dataclasses import replace
 
 import pytest
 import torch

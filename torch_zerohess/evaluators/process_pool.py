@@ -67,10 +67,8 @@ class ProcessPool(Ahead):
     such as `sigmoid`, may round differently in the last bit when a call has fewer points. The number of workers makes
     no difference to them either.) fn gets tensors on the CPU. The default type of torch is the caller's.
 
-    Noise differs between workers. Each has seeds of its own for the generators of the process (`torch.manual_seed`,
-    `random`, `numpy.random`). A generator that fn holds, or that its code names, gets a seed of the worker after the
-    first call that draws from it, and this call is made again. So a black box that draws from copies of its generator,
-    or that draws a table once and keeps it, counts as deterministic. `timeout` is for each of the two calls.
+    Noise differs between workers. A generator that fn holds gets a seed of the worker after the first call that draws
+    from it, and this call is made again, see `evaluators.random_numbers`. `timeout` is for each of the two calls.
 
     The pool ends when it is closed, with the interpreter, and on Linux at once when the interpreter is killed.
 

@@ -22,7 +22,7 @@ from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.memory import Memory, check_memory
 

@@ -25,7 +25,7 @@ from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 

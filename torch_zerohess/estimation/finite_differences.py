@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.inputs import NO_GRAPH, all_finite, check_no_derivative, checked_input, short, working
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 
 _INEXACT = 0.1

@@ -12,7 +12,7 @@ from torch_zerohess.estimation.inputs import check_no_derivative, checked_input,
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values
 from torch_zerohess.estimation.perturbations import perturb
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fewest_samples, fit_sparse

@@ -19,8 +19,9 @@ from torch import Tensor
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
+from torch_zerohess.evaluators.evaluator import Closing, EvaluationFuture
 from torch_zerohess.evaluators.factory import Each, same
-from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.inline import values_without_points
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.partial_values import keep_finished
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
@@ -119,14 +120,14 @@ class Executor(Closing):
             for _, task in tasks:
                 task.cancel()
 
-    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
+    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> EvaluationFuture:
         """Return a future of what a call with these arguments returns; several may be under way."""
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
         if len(points) == 0:
-            return Evaluation.of(lambda: values_without_points(fn, points, aux))
+            return EvaluationFuture.of(lambda: values_without_points(fn, points, aux))
         batch, tasks = self._tasks(fn, points, aux)
-        future, device = Evaluation(), points.device
+        future, device = EvaluationFuture(), points.device
         future.set_running_or_notify_cancel()  # what was given to the executor is its own
         _wait_all([task for _, task in tasks], lambda: future.settle(lambda: _joined(batch, tasks).to(device)))
         return future

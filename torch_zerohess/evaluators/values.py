@@ -70,8 +70,8 @@ def as_tensor(result: Any) -> Tensor:
     if isinstance(result, Mapping):
         names = ", ".join(map(repr, itertools.islice(result, _SHOWN))) + (", ..." if len(result) > _SHOWN else "")
         raise ReturnedTypeError(
-            f"fn must return one tensor [K, *out], got a {type(result).__name__} of {names or 'nothing'}: return one of "
-            "its values, or join them along dimension 1"
+            f"fn must return one tensor [K, *out], got a {type(result).__name__} of {names or 'nothing'}: return one "
+            "of its values, or join them along dimension 1"
         )
     try:
         result = stacked(result)

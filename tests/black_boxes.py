@@ -1,5 +1,6 @@
 """Black boxes at the top of a module, as worker processes need them."""
 
+import copy
 import os
 import signal
 import time
@@ -314,3 +315,74 @@ def seeded():
     """Return a black box after a seed for the generator of NumPy, which all processes share."""
     np.random.seed(0)
     return noisy_with_numpy
+
+
+class Common:
+    """Common random numbers: every call draws from a copy of one generator."""
+
+    def __init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(0)
+
+    def __call__(self, z):
+        time.sleep(0.02)
+        draws = torch.randn(8, dtype=z.dtype, generator=self.generator.clone_state())
+        return (z + draws).square().mean(1)
+
+
+def common_late(z):
+    """The same with a generator that comes with the first call."""
+    import late_table
+
+    time.sleep(0.02)
+    draws = copy.deepcopy(late_table.GENERATOR).standard_normal(8)
+    return (z + torch.from_numpy(draws)).square().mean(1)
+
+
+class Tabulated:
+    """A table that the first call draws."""
+
+    def __init__(self) -> None:
+        self.generator, self.table = np.random.default_rng(0), None
+
+    def __call__(self, z):
+        time.sleep(0.02)
+        if self.table is None:
+            self.table = torch.from_numpy(self.generator.standard_normal(8))
+        return (z + self.table).square().mean(1)
+
+
+class Restarted:
+    """Common random numbers: every call gives the generator the same seed."""
+
+    def __init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(1)
+
+    def __call__(self, z):
+        time.sleep(0.02)
+        return (z + torch.randn(8, dtype=z.dtype, generator=self.generator.manual_seed(0))).square().mean(1)
+
+
+class Paired:
+    """Noise whose numbers come in pairs, of which the generator keeps the second one."""
+
+    def __init__(self) -> None:
+        self.generator = np.random.RandomState(0)
+
+    def __call__(self, z):
+        time.sleep(0.02)
+        return z[:, 0] + self.generator.normal()
+
+
+class AfterAWhile(Noisy):
+    """Noise from the third call on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+
+    def __call__(self, z):
+        self.calls += 1
+        if self.calls > 2:
+            return super().__call__(z)
+        time.sleep(0.02)
+        return z[:, 0] + 10 * os.getpid() + self.calls

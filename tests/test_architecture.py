@@ -168,15 +168,16 @@ def test_modules_are_small_and_say_what_they_are(tree: str, path: Path) -> None:
     assert ast.get_docstring(ast.parse(text)), "a module begins with what it is about"
 
 
-# Private modules and attributes of torch, and private methods of its objects. `torch_zerohess._C` is ours.
+# Private modules and attributes of torch, and private members of its objects. `torch_zerohess._C` is ours.
 PRIVATE = re.compile(
-    r"\b(torch\._(?!_version__)\w+|forward_ad\._\w+|_functorch|_subclasses|_is_zerotensor|_backward_cls)\b"
+    r"\b(torch\._(?!_version__)\w+|forward_ad\._\w+|_functorch|_subclasses|_is_zerotensor|_backward_cls|(?<=\.)_version)\b"
 )
 
 
-def test_private_names_of_torch_are_in_one_file() -> None:
+def test_private_names_of_torch_are_in_one_file_but_for_one() -> None:
     found = {name("torch_zerohess", path): PRIVATE.findall(path.read_text()) for path in MODULES["torch_zerohess"]}
     assert found.pop("autograd.transforms"), "the file that may use them has none: the pattern finds nothing"
+    assert found.pop("estimation.inputs") == ["_version"]
     assert not {module: names for module, names in found.items() if names}, "they belong into autograd/transforms.py"
 
 

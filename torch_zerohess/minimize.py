@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer
 from torch_zerohess.estimation.call import BlackBoxCall
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.minimization.callback import Callback
 from torch_zerohess.minimization.evaluating import evaluating

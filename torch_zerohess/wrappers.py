@@ -1,6 +1,8 @@
-"""Which tensors are wrappers that a transform of torch has handed out."""
+"""Which tensors are wrappers that a transform of torch has handed out, and which of them are differentiated."""
 
+import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 
 def readable(tensor: Tensor) -> bool:
@@ -10,3 +12,19 @@ def readable(tensor: Tensor) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def differentiated(tensor: Tensor) -> bool:
+    """Whether a transform of torch, or forward mode, takes the derivative with respect to a tensor.
+
+    Plain autograd does not count: a tensor that requires grad may be given to what takes its numbers alone.
+    """
+    while True:
+        if forward_ad.unpack_dual(tensor).tangent is not None:
+            return True
+        inner = torch.func.debug_unwrap(tensor, recurse=False)
+        if inner is tensor:
+            return False
+        if tensor.requires_grad:
+            return True
+        tensor = inner

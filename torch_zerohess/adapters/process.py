@@ -17,7 +17,7 @@ from torch_zerohess.adapters.command import checked_environment, found_program
 from torch_zerohess.adapters.server import GRACE, Server, end_program, ended, late, shown
 from torch_zerohess.arguments import check_bool, check_tensors, checked_number
 from torch_zerohess.evaluators.batch import numbers
-from torch_zerohess.evaluators.inline import Closing
+from torch_zerohess.evaluators.evaluator import Closing
 from torch_zerohess.evaluators.lifetime import ends_by_its_group
 from torch_zerohess.evaluators.partial_values import keep_finished
 from torch_zerohess.evaluators.values import as_tensor

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import IO, Any
 
-from torch_zerohess.evaluators.lifetime import end_group, end_tree, ends_by_its_group
+from torch_zerohess.evaluators.lifetime import end_group, end_tree, ending, ends_by_its_group
 
 GRACE = 1.0
 """Seconds that a program has to end, and that pipes have to close after it."""
@@ -164,7 +164,8 @@ def late(command: Sequence[str], limit: float | None, errors: bytes) -> str:
 
 def ended(command: Sequence[str], code: int, errors: bytes) -> str:
     """Return the message for a program that ended by itself, with its standard error."""
-    return f"the program {command[0]!r} ended with code {code} and without an answer{shown(errors)}"
+    how = f"was killed by signal {-code} ({ending(code)})" if code < 0 else f"ended with code {code}"
+    return f"the program {command[0]!r} {how} and without an answer{shown(errors)}"
 
 
 def shown(errors: bytes) -> str:

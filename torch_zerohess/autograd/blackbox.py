@@ -22,7 +22,7 @@ from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
@@ -195,19 +195,19 @@ class BlackBox(Layer):
             self.control = Control.of(self.memory, self.call.outer, learning=self.training)
             seed = self.smoothing.drawn_seed(self.control.taken)
         try:
-            return control_variate.around(
-                self.control,
-                self.memory.surrogate if zero else copy.deepcopy(self.memory.surrogate),
-                center,
-                aux,
-                self.smoothing.sigma_vector(center.shape[1], center.device),
-                seed,
-                self.smoothing.order,
-                lambda count: opaque.nodes(self._handle, seed, count, center, aux),
-                lambda part, its_aux: self._estimated(part, its_aux, zero),
+            return control_variate.Around(
+                control=self.control,
+                surrogate=self.memory.surrogate if zero else copy.deepcopy(self.memory.surrogate),
+                center=center,
+                aux=aux,
+                sigma=self.smoothing.sigma_vector(center.shape[1], center.device),
+                seed=seed,
+                order=self.smoothing.order,
                 value=self.call.value,
                 zero=zero,
-            )
+                nodes=lambda count: opaque.nodes(self._handle, seed, count, center, aux),
+                estimated=lambda part, its_aux: self._estimated(part, its_aux, zero),
+            ).evaluated()
         finally:
             self.control = None
 

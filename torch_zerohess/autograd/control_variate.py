@@ -66,83 +66,114 @@ def _check_finite(result: Tensor) -> None:
             raise ValueError(NOT_FINITE)
 
 
-def around(
-    control: Control,
-    surrogate: Any,
-    center: Tensor,
-    aux: Sequence[Tensor],
-    sigma: Tensor,
-    seed: int,
-    order: int,
-    nodes: Callable[[int], Tensor],
-    estimated: Callable[[Tensor, list[Tensor]], tuple[Part, Tensor]],
-    *,
-    value: str,
-    zero: bool,
-) -> Part:
-    """Evaluate around a center [B, n] and return the estimate of the layer as a function of x [B, n].
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Around:
+    """A call of a layer with a memory, around a center."""
 
-    Args:
-        control: coefficient, head and memory.
-        surrogate: of the memory, or a copy where the function outlives this call.
-        center: [B, n].
-        aux: [B, ...] each.
-        sigma: float64 [n].
-        seed: of the choice of fresh elements, and of how the surrogate's term is differentiated.
-        order: highest derivative that is wanted.
-        nodes: points per element -> points u [B, Q, n] of the surrogate's term, see `surrogate_mean.nodes`.
-        estimated: evaluates around a part of the batch, with its aux, and returns the estimate of the residual, and
-            its constants, see `Outer.kept`.
-        value: "center" or "smoothed", see `BlackBox`.
-        zero: promises that the function is called with the center alone.
+    control: Control
+    """Coefficient, head and memory."""
+    surrogate: Any
+    """Of the memory, or a copy where the function outlives this call."""
+    center: Tensor
+    """[B, n]."""
+    aux: Sequence[Tensor]
+    """[B, ...] each."""
+    sigma: Tensor
+    """float64 [n]."""
+    seed: int
+    """Of the choice of fresh elements, and of how the surrogate's term is differentiated."""
+    order: int
+    """Highest derivative that is wanted."""
+    value: str
+    """"center" or "smoothed", see `BlackBox`."""
+    zero: bool
+    """Promises that the function is called with the center alone."""
+    nodes: Callable[[int], Tensor]
+    """Points per element -> points u [B, Q, n] of the surrogate's term, see `surrogate_mean.nodes`."""
+    estimated: Callable[[Tensor, list[Tensor]], tuple[Part, Tensor]]
+    """Evaluates around a part of the batch, with its aux.
+
+    It returns the estimate of the residual, and its constants, see `Outer.kept`.
     """
-    memory, outer = control.memory, control.outer
-    fresh = _Fresh.drawn(memory.fresh, center, seed)
-    part, spread = fresh.part, fresh.spread
-    if not control.active:
-        alone, constants = estimated(center[part], fresh.of(aux))
-        start = None if zero else alone(center[part]).detach()
-        return lambda x: spread(outer.value(alone(x.index_select(0, part)), constants, value, start))
-    with torch.no_grad():
-        predicted = Prediction(control, surrogate, aux)
-    excess = predicted.excess(sigma) if outer.linear else None
-    if excess is None:
-        pathwise = _pathwise(control, center, aux, sigma, order, seed)
-        u = nodes(per_element(memory.draws, center.shape[1], len(center), pathwise=pathwise))
-    else:  # the mean over all points is known from the center
-        u, pathwise = sigma.new_zeros(1, 1, len(sigma)), 2
-    if not len(part):
-        predicted.check_head(center)
-    with torch.no_grad():
-        at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
-        scales = outer.scales(
-            lambda: predicted((center[:, None] + sigma * u).to(center.dtype)), lambda losses: losses.mean(1)
-        )
-    whole_aux = [*aux, *predicted.encoded, *([] if scales is None else [scales])]
-    rest = estimated(center[part], fresh.of(whole_aux)) if len(part) else None
 
-    def values(z: Tensor) -> Tensor:
-        inner = outer.inner(predicted(z), scales)
-        return control.coefficient * (inner if excess is None else inner + excess)
+    def evaluated(self) -> Part:
+        """Evaluate, and return the estimate of the layer as a function of x [B, n]."""
+        outer, center = self.control.outer, self.center
+        fresh = _Fresh.drawn(self.control.memory.fresh, center, self.seed)
+        if not self.control.active:
+            return self._alone(fresh)
+        terms = self._terms(fresh)
+        if self.value == "smoothed":
+            return lambda x: terms.at(x)[0]
+        with torch.no_grad():
+            at_center = self.control.coefficient * terms.predicted(center[:, None])[:, 0]
+        fixed = None if self.zero else terms.at(center)
 
-    def expected(x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """F at x, and what the new evaluations show about its fresh elements."""
-        term = smoothed(values, x, center, sigma, u, pathwise=pathwise, plain=not transforms.transform_active())
-        new = None if rest is None else rest[0](x.index_select(0, part))
-        return outer.corrected(term, None if new is None else spread(new), scales), new
+        def centered(x: Tensor) -> Tensor:
+            result, new = terms.at(x)
+            start, new = (result, new) if fixed is None else fixed
+            at = at_center
+            if terms.rest is not None and new is not None:
+                at = at + fresh.spread(outer.value(new, terms.rest[1], self.value).detach() - at[fresh.part])
+            return result - start.detach() + at.to(x.dtype)
 
-    fixed = None if zero or value == "smoothed" else expected(center)
+        return centered
 
-    def whole(x: Tensor) -> Tensor:
-        result, new = expected(x)
-        if rest is None:
+    def _alone(self, fresh: _Fresh) -> Part:
+        """Return the estimate where there is no surrogate yet: the residual is the whole."""
+        outer, part = self.control.outer, fresh.part
+        alone, constants = self.estimated(self.center[part], fresh.of(self.aux))
+        start = None if self.zero else alone(self.center[part]).detach()
+        return lambda x: fresh.spread(outer.value(alone(x.index_select(0, part)), constants, self.value, start))
+
+    def _terms(self, fresh: _Fresh) -> "_Terms":
+        control, center, sigma, part = self.control, self.center, self.sigma, fresh.part
+        with torch.no_grad():
+            predicted = Prediction(control, self.surrogate, self.aux)
+        excess = predicted.excess(sigma) if control.outer.linear else None
+        if excess is None:
+            pathwise = _pathwise(control, center, self.aux, sigma, self.order, self.seed)
+            u = self.nodes(per_element(control.memory.draws, center.shape[1], len(center), pathwise=pathwise))
+        else:  # the mean over all points is known from the center
+            u, pathwise = sigma.new_zeros(1, 1, len(sigma)), 2
+        if not len(part):
+            predicted.check_head(center)
+        with torch.no_grad():
+            scales = control.outer.scales(
+                lambda: predicted((center[:, None] + sigma * u).to(center.dtype)), lambda losses: losses.mean(1)
+            )
+        whole_aux = [*self.aux, *predicted.encoded, *([] if scales is None else [scales])]
+        rest = self.estimated(center[part], fresh.of(whole_aux)) if len(part) else None
+        return _Terms(self, fresh, predicted, rest, u, pathwise, scales, excess)
+
+
+@dataclass(frozen=True, eq=False)
+class _Terms:
+    """The smoothed surrogate, and the estimate of the residual."""
+
+    call: Around
+    fresh: _Fresh
+    predicted: Prediction
+    rest: tuple[Part, Tensor] | None
+    """The estimate of the residual and its constants; None where no element is evaluated anew."""
+    u: Tensor
+    pathwise: int
+    """Orders of derivatives along the points, see `surrogate_mean`."""
+    scales: Tensor | None
+    excess: Tensor | None
+    """The mean of the surrogate's losses minus its loss at x, where this is the same for all x."""
+
+    def at(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return F at x, and what the new evaluations show about its fresh elements."""
+        call, plain = self.call, not transforms.transform_active()
+        term = smoothed(self._values, x, call.center, call.sigma, self.u, pathwise=self.pathwise, plain=plain)
+        new = None if self.rest is None else self.rest[0](x.index_select(0, self.fresh.part))
+        change = None if new is None else self.fresh.spread(new)
+        result = call.control.outer.corrected(term, change, self.scales)
+        if self.rest is None:
             _check_finite(result)
-        if value == "smoothed":
-            return result
-        start, new = (result, new) if fixed is None else fixed
-        at = at_center
-        if rest is not None and new is not None:
-            at = at + spread(outer.value(new, rest[1], value).detach() - at[part])
-        return result - start.detach() + at.to(x.dtype)
+        return result, new
 
-    return whole
+    def _values(self, z: Tensor) -> Tensor:
+        control, inner = self.call.control, self.call.control.outer.inner(self.predicted(z), self.scales)
+        return control.coefficient * (inner if self.excess is None else inner + self.excess)

@@ -14,7 +14,7 @@ from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.evaluation import evaluate_center
 from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import check_output, sparse_jacobian
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_grid, checked_rate

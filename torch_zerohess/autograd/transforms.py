@@ -1,6 +1,7 @@
-"""Questions about torch's transforms that have no public answer: the only file with private names of torch.
+"""Questions about torch's transforms that have no public answer: the file with the private names of torch.
 
-All of these names were tried with torch 2.15. If a version of torch drops one, it is replaced here and nowhere else.
+All of these names were tried with torch 2.15. If a version of torch drops one, it is replaced here. One more,
+`Tensor._version`, is in `estimation/inputs.py`, which must not import from here: how often a tensor was changed.
 
 | question | private name | why no public name serves |
 |---|---|---|

@@ -14,8 +14,9 @@ from torch_zerohess.estimation.head import Head, apply_head
 from torch_zerohess.estimation.inputs import all_finite, times_changed
 from torch_zerohess.estimation.outer import Outer, outer_of
 from torch_zerohess.evaluators.batch import loss_error
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.evaluators.factory import Each
-from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.inline import Inline
 from torch_zerohess.evaluators.payload import RemoteTraceback
 from torch_zerohess.evaluators.values import checked_values
 

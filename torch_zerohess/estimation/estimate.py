@@ -12,16 +12,22 @@ from torch_zerohess.estimation.call import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import evaluate
 from torch_zerohess.estimation.head import Head
-from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
+from torch_zerohess.estimation.inputs import (
+    NO_GRAPH,
+    check_aux,
+    check_no_derivative,
+    checked_input,
+    folded_aux,
+    working,
+)
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
-from torch_zerohess.wrappers import readable
 
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
 _ROUNDING = 64 * torch.finfo(torch.float64).eps  # of a sum, relative to the sum of the magnitudes
@@ -55,7 +61,8 @@ def estimate(
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else. Without aux if there is a head.
-        x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came.
+        x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came. An x
+            that requires grad is taken as x.detach(): autograd sees a constant. Transforms of `torch.func` are refused.
         smoothing: how to sample.
         *aux: further inputs of fn, [*batch, ...] each, repeated for every evaluation of their batch element; with a
             head its inputs, which are not copied. float16 and bfloat16 become float32.
@@ -92,8 +99,8 @@ def estimate(
     call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head, joint)
     check_limits(tolerance, tolerance_of, max_evaluations)
     _check_memory(call, aux, memory, tolerance)
+    check_no_derivative(NO_GRAPH, x=checked_input(x), **{f"aux[{k}]": one for k, one in enumerate(aux)})
     x = checked_input(x).detach().clone()
-    _check_not_mapped(x)
     if joint and (x.ndim != 2 or head is not None or memory is not None):
         raise ValueError(
             f"joint=True needs x of shape [B, n], and neither head nor memory, got x {list(x.shape)}, "
@@ -147,18 +154,6 @@ def _check_memory(call: BlackBoxCall, aux: Sequence[Tensor], memory: Memory | No
         raise ValueError(
             f"a memory serves one batch, a tolerance asks for several: give one of the two, got tolerance {tolerance}"
         )
-
-
-def _check_not_mapped(x: Tensor) -> None:
-    """Raise ValueError if `torch.vmap` maps over x: of all wrappers, only those of vmap give no numbers."""
-    if readable(x):
-        return
-    try:
-        x.sum().item()
-    except RuntimeError as error:
-        raise ValueError(
-            "x must not be mapped over by vmap: estimate takes a batch x [*batch, n] in one call, and smooth has vmap"
-        ) from error
 
 
 def _relative_error(batches: list[Sums], of: Derivative) -> tuple[float, bool]:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.estimate import estimate
-from torch_zerohess.estimation.inputs import all_finite, checked_input, short, working
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.estimation.inputs import NO_GRAPH, all_finite, check_no_derivative, checked_input, short, working
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 
 _INEXACT = 0.1
@@ -39,7 +39,7 @@ def finite_difference_hvp(
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], or of one point where not `vectorized`, as for `estimate`.
-        x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came.
+        x: [*batch, n], as for `estimate`; neither x nor v is differentiated.
         v: [*batch, n] or [n]; a zero vector gives zero.
         smoothing: how to sample each of the two gradients.
         *aux: further inputs of fn, [*batch, ...] each.
@@ -68,6 +68,7 @@ def finite_difference_hvp(
     n = x.shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):
         raise ValueError(f"v must be a tensor of shape [{n}] or of the shape of x, got {getattr(v, 'shape', v)}")
+    check_no_derivative(NO_GRAPH, x=x, v=v)
     if not all_finite(v):
         raise ValueError(f"v must be finite, got {short(v)}")
     checked_number("step", step, above=0.0, below=math.inf)
@@ -88,8 +89,8 @@ def finite_difference_hvp(
     other = seed if common else seed ^ (1 << 61)
     how: dict[str, Any] = {"vectorized": vectorized, "evaluator": evaluator, "on_nonfinite": on_nonfinite}
     forward, backward = (
-        estimate(fn, x + sign * offset, smoothing.replace(seed=s), *aux, value="smoothed", **how).gradient
+        estimate(fn, x + sign * offset, smoothing.replace(seed=s), *aux, value="smoothed", **how)
         for sign, s in ((1.0, seed), (-1.0, other))
     )
-    scale = length.reshape(*length.shape[:-1], *[1] * (forward.dim() - length.dim()), 1)
-    return ((forward - backward) * (scale / (2 * step)).to(x.dtype)).to(dtype)
+    difference = forward._unrounded_gradient() - backward._unrounded_gradient()  # of numbers that may be nearly equal
+    return forward._shaped(difference * (length / (2 * step)).reshape(-1, 1, 1), "product with the Hessian").to(dtype)

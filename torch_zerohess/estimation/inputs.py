@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 from torch.fx import Proxy
 
+from torch_zerohess.wrappers import differentiated, readable
+
+NO_GRAPH = "an estimate has no graph: use smooth(fn, smoothing)"
 _FEW = 64  # numbers up to which Python is faster than an operation of torch
 _SHOWN = 8  # numbers of a tensor that a text shows
 _HALF = (torch.float16, torch.bfloat16)
@@ -34,6 +37,30 @@ def checked_input(x: Any, *, empty: bool = False) -> Tensor:
         wanted = "n > 0" if empty else "n and every batch dimension > 0"
         raise ValueError(f"x must have shape [*batch, n] with {wanted}, got {list(x.shape)}")
     return x
+
+
+def check_no_derivative(instead: str, **given: Tensor) -> None:
+    """Raise ValueError if a transform of torch maps over a tensor, or differentiates it: results have no graph.
+
+    instead: "where such a result has none: use this", for the message.
+    """
+    for name, one in given.items():
+        _check_not_mapped(name, one)
+        if differentiated(one):
+            raise ValueError(f"{name} is differentiated, and {instead}")
+
+
+def _check_not_mapped(name: str, x: Tensor) -> None:
+    """Raise ValueError if `torch.vmap` maps over x: of all wrappers, only those of vmap give no numbers."""
+    if readable(x):
+        return
+    try:
+        x.sum().item()
+    except RuntimeError as error:
+        raise ValueError(
+            f"{name} must not be mapped over by vmap: give a batch [*batch, n] in one call, where that is possible; "
+            "smooth has vmap"
+        ) from error
 
 
 def _check_not_nested(name: str, x: Tensor) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.call import ValueMode
-from torch_zerohess.estimation.inputs import all_finite, attribute, short
+from torch_zerohess.estimation.inputs import NO_GRAPH, all_finite, attribute, check_no_derivative, short
 from torch_zerohess.estimation.skewness import Shape, extension
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
@@ -68,11 +68,12 @@ class Estimate:
     @property
     def gradient(self) -> Tensor:
         """dF/dx_i: [*batch, *out, n]."""
-        return self._once("gradient", self._gradient)
+        return self._once("gradient", lambda: self._shaped(self._unrounded_gradient(), "gradient"))
 
-    def _gradient(self) -> Tensor:
+    def _unrounded_gradient(self) -> Tensor:
+        """dF/dx_i in float64, [B, P, n]."""
         mean = combined(self._batches, lambda one: one.stein.scaled_gradient(one.a, self._sigma))
-        return self._shaped(self._completed(mean, "gradient"), "gradient")
+        return self._completed(mean, "gradient")
 
     def hvp(self, v: Tensor) -> Tensor:
         """Hessian of F times v [*batch, n] or [n]: [*batch, *out, n], O(K n) without the Hessian."""
@@ -291,6 +292,7 @@ class Estimate:
             given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
             wanted = " or ".join(map(str, dict.fromkeys((f"[{n}]", f"{[*self._batch, n]}"))))
             raise ValueError(f"v must be a tensor of shape {wanted}, got {given}")
+        check_no_derivative(NO_GRAPH, v=v)
         if not all_finite(v):
             raise ValueError(f"v must be finite, got {short(v)}")
         v = v.detach().to(self._sigma)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.call import BlackBoxCall
-from torch_zerohess.estimation.inputs import checked_input, working
+from torch_zerohess.estimation.inputs import check_no_derivative, checked_input, working
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values
 from torch_zerohess.estimation.perturbations import perturb
-from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fewest_samples, fit_sparse
@@ -49,7 +49,7 @@ def sparse_jacobian(
         fn: [K, n] -> [K, *out], an image or another output of at least two numbers. Outputs of two dimensions or more
             are images, whose neighbouring pixels share evidence: [h, w], [*stack, h, w] as with channels first, and
             [*stack, h, w, channels] with up to four channels.
-        x: [n], float32 or float64.
+        x: [n], float32 or float64. An x that requires grad is taken as x.detach(), as by `estimate`.
         smoothing: how to sample; proposal "aggregate", "gaussian" or "uniform", sampler "random" or "orthogonal". For
             sampler "auto" it is "orthogonal" where `estimate` takes Sobol points. In many dimensions their coordinates
             are correlated, as if outputs depended on further parameters. Proposal "optimal" is refused because it
@@ -90,7 +90,8 @@ def sparse_jacobian(
         (200, True, True)
     """
     check_smoothing(smoothing)
-    x = checked_input(x).detach()
+    check_no_derivative("a sparse Jacobian has no graph: use SparseBlackBox", x=checked_input(x))
+    x = x.detach()
     if x.ndim != 1:
         raise ValueError(f"x must be one point [n], got {list(x.shape)}")
     smoothing = _resolved(smoothing, len(x))

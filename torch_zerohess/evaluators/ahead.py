@@ -19,8 +19,9 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.evaluators.batch import MOST, Batch
+from torch_zerohess.evaluators.evaluator import Closing, EvaluationFuture
 from torch_zerohess.evaluators.factory import same
-from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.inline import values_without_points
 from torch_zerohess.evaluators.job import Function, Job
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.partial_values import keep_finished
@@ -64,7 +65,7 @@ class Ahead(Closing, ABC):
             keep_finished(error, points, job.batch.known)
             raise
 
-    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
+    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> EvaluationFuture:
         """Return a `concurrent.futures.Future` of what a call with these arguments returns.
 
         Several may be under way: their points share the workers, in the order of the submissions. The `lost` of the
@@ -73,7 +74,7 @@ class Ahead(Closing, ABC):
         """
         self._check_open()
         if len(points) == 0:
-            return Evaluation.of(lambda: values_without_points(fn, points, aux))
+            return EvaluationFuture.of(lambda: values_without_points(fn, points, aux))
         job = self._job(fn, points.clone(), [one.clone() for one in aux])  # the caller may write to them
         self._queue(job)
         return job.future

@@ -68,7 +68,10 @@ class Batch:
     _failures: list[str] = field(default_factory=list)
     """Why evaluations of single points failed."""
     _first: set[int] | None = None
-    """Where the chunks start that were being evaluated at the first failure, and have not failed since."""
+    """Starts of the chunks that were running at the first failure and have not failed yet.
+
+    `hopeless` waits for them.
+    """
     _values: dict[int, Part] = field(default_factory=dict)
     _error: tuple[int, BaseException] | None = None
 

@@ -1,14 +1,16 @@
 """Evaluation by an executor of somebody else: the standard pools, loky, dask, mpi4py."""
 
 import concurrent.futures
+import copyreg
 import functools
 import hashlib
+import io
 import itertools
 import pickle
 import threading
 import traceback
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,16 +19,34 @@ from torch import Tensor
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
+from torch_zerohess.evaluators.evaluator import Closing, EvaluationFuture
 from torch_zerohess.evaluators.factory import Each, same
-from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.inline import values_without_points
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.partial_values import keep_finished
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
-from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
+from torch_zerohess.evaluators.random_numbers import Apart
 from torch_zerohess.evaluators.values import checked_values
 
-_kept: dict[str, Callable[..., Any]] = {}
+
+class Kept:
+    """A black box of a worker, and how its random numbers are drawn, once it is called."""
+
+    def __init__(self, fn: Callable[..., Any]) -> None:
+        self.fn = fn
+        self._apart: Apart | None = None
+        self._lock = threading.Lock()
+
+    def values(self, data: bytes) -> bytes:
+        """Return the values of points and auxiliary inputs, all as bytes."""
+        with self._lock:  # the workers of dask have threads
+            self._apart = self._apart or in_this_process(Apart, self.fn)
+            apart: Apart = self._apart
+        return apart.call(functools.partial(values_of, self.fn, data))
+
+
+_kept: dict[str, Kept] = {}
 _lock = threading.Lock()
 _numbers = itertools.count()
 """Of tasks: dask takes tasks with equal arguments for one."""
@@ -49,10 +69,10 @@ class Executor(Closing):
     the global variables that the function names. The standard `ProcessPoolExecutor` sends a function by its name: its
     global variables are those of the worker.
 
-    Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
-    of the first point is raised, also SystemExit; one that cannot be sent is a RuntimeError that names it. An executor
-    whose workers ended raises its own error (`BrokenExecutor`): it has no limit of time and no second try, which
-    `ProcessPool` and `Ray` have.
+    Values have the same bits as with `Inline`, and random numbers differ, as described for `ProcessPool`. Of several
+    exceptions of the black box, the exception of the first point is raised, also SystemExit; one that cannot be sent is
+    a RuntimeError that names it. An executor whose workers ended raises its own error (`BrokenExecutor`): it has no
+    limit of time and no second try, which `ProcessPool` and `Ray` have.
 
     The executor is the caller's: `close()` does not shut it down.
 
@@ -100,14 +120,14 @@ class Executor(Closing):
             for _, task in tasks:
                 task.cancel()
 
-    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
+    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> EvaluationFuture:
         """Return a future of what a call with these arguments returns; several may be under way."""
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
         if len(points) == 0:
-            return Evaluation.of(lambda: values_without_points(fn, points, aux))
+            return EvaluationFuture.of(lambda: values_without_points(fn, points, aux))
         batch, tasks = self._tasks(fn, points, aux)
-        future, device = Evaluation(), points.device
+        future, device = EvaluationFuture(), points.device
         future.set_running_or_notify_cancel()  # what was given to the executor is its own
         _wait_all([task for _, task in tasks], lambda: future.settle(lambda: _joined(batch, tasks).to(device)))
         return future
@@ -116,7 +136,7 @@ class Executor(Closing):
         """Submit the chunks of points."""
         threads = isinstance(self.executor, concurrent.futures.ThreadPoolExecutor)  # they use the black box itself
         standard = isinstance(self.executor, concurrent.futures.ProcessPoolExecutor)
-        state = b"" if threads else _state(fn, pickle.dumps if standard else _dumps())
+        state = b"" if threads else _state(fn, pickle.Pickler if standard else _pickler())
         with _lock:
             name = next((one for one, known in self._names.items() if same(known[0], fn) and known[1] == state), "")
             if not name:
@@ -144,12 +164,23 @@ class Executor(Closing):
         self._names.clear()
 
 
-def _state(fn: Callable[..., Any], dumps: Callable[[Any], bytes]) -> bytes:
-    """Return a digest of what the workers get for a black box; the same for all that are not picklable."""
+def _state(fn: Callable[..., Any], pickler: type[pickle.Pickler]) -> bytes:
+    """Return a digest of what the workers get for a black box; the same for all that are not picklable.
+
+    The pickled form of a generator of torch has an address in it, which is another one every time.
+    """
+    others: Mapping[Any, Any] = copyreg.dispatch_table if pickler is pickle.Pickler else pickler.dispatch_table
+    stable = type("Stable", (pickler,), {"dispatch_table": {**others, torch.Generator: _by_state}})
+    file = io.BytesIO()
     try:
-        return hashlib.sha256(dumps(fn)).digest()
+        stable(file).dump(fn)
     except Exception:  # what pickle raises is up to the object
         return b""
+    return hashlib.sha256(file.getvalue()).digest()
+
+
+def _by_state(generator: torch.Generator) -> tuple[Any, ...]:
+    return torch.Generator, (str(generator.device),), transfer.packed([generator.get_state()])
 
 
 def _joined(batch: Batch, tasks: Tasks) -> Tensor:
@@ -196,30 +227,32 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
     if caller != identity():
         take_default_dtype(dtype)
     with _lock:
-        if is_new := name not in _kept:
+        if name not in _kept:
             make_room(_kept)
-            _kept[name] = fn
-        fn = used(_kept, name)
-    evaluate = functools.partial(values_of, fn, data)
+            _kept[name] = Kept(fn)
+        kept = used(_kept, name)
     try:
-        if is_new:
-            generators = in_this_process(draw_apart, fn)
-            return True, drawn_apart(fn, generators, evaluate)
-        return True, evaluate()
+        return True, kept.values(data)
     except BaseException as error:  # SystemExit too
         if caller == identity():  # a thread: the error itself can be raised, but here it would end a thread of dask
             return False, error
-        return False, dumped_error(error, traceback.format_exc(), _dumps())
+        return False, dumped_error(error, traceback.format_exc(), _dumps)
 
 
-def _dumps() -> Callable[[Any], bytes]:
-    """Return cloudpickle, which loky and dask bring, and which also writes classes and functions of a script."""
+def _pickler() -> type[pickle.Pickler]:
+    """Return that of cloudpickle, which loky and dask bring: it also writes classes and functions of a script."""
     try:
         import cloudpickle
     except ModuleNotFoundError:
-        return pickle.dumps
-    dumps: Callable[[Any], bytes] = cloudpickle.dumps
-    return dumps
+        return pickle.Pickler
+    found: type[pickle.Pickler] = cloudpickle.Pickler
+    return found
+
+
+def _dumps(thing: Any) -> bytes:
+    file = io.BytesIO()
+    _pickler()(file).dump(thing)
+    return file.getvalue()
 
 
 def values_of(fn: Callable[..., Any], data: bytes) -> bytes:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.batch import Batch
-from torch_zerohess.evaluators.inline import Evaluation
+from torch_zerohess.evaluators.evaluator import EvaluationFuture
 from torch_zerohess.evaluators.transfer import Part
 
 
@@ -34,7 +34,7 @@ class Job:
     """Points [K, n] and aux [K, ...], on the CPU."""
     device: torch.device
     batch: Batch
-    future: Evaluation = field(default_factory=Evaluation)
+    future: EvaluationFuture = field(default_factory=EvaluationFuture)
     error: BaseException | None = None
     """Why the call fails, whatever its points do."""
     _begun: bool = False

@@ -67,6 +67,9 @@ class ProcessPool(Ahead):
     such as `sigmoid`, may round differently in the last bit when a call has fewer points. The number of workers makes
     no difference to them either.) fn gets tensors on the CPU. The default type of torch is the caller's.
 
+    Noise differs between workers. A generator that fn holds gets a seed of the worker after the first call that draws
+    from it, and this call is made again, see `evaluators.random_numbers`. `timeout` is for each of the two calls.
+
     The pool ends when it is closed, with the interpreter, and on Linux at once when the interpreter is killed.
 
     Args:
@@ -174,7 +177,7 @@ class ProcessPool(Ahead):
                 self._bell[1].send_bytes(b"")
 
     def _staff(self, jobs: Sequence[Job]) -> None:
-        """Have a worker for every chunk, as far as they may be, and none that is due to be replaced."""
+        """Replace workers that are due, and start new ones: one per chunk, at most `workers`."""
         for one in [one for one in self._staffed if one.ready and self.recycle and one.evaluations >= self.recycle]:
             self._staffed.remove(one)
             one.leave()

@@ -1,7 +1,13 @@
-"""Random numbers of black boxes in workers: every process draws its own.
+"""Random numbers of black boxes in workers: every process draws its own, and a black box without noise stays so.
 
 Every worker gets the same black box, so its generators begin with the same state. Workers would draw alike, and the
-noise of repeated values would look smaller than it is.
+noise of repeated values would look smaller than it is. But a black box may also draw from a copy of a generator in
+every call, or draw a table in its first call: then equal draws are what makes it a function.
+
+So a worker seeds only the generators of the process at once: those of torch, and behind the functions of `random` and
+`numpy.random`. A generator that the black box holds keeps its state until a call has drawn from it. It then gets a seed
+of the worker, and this call is made again. What the first of the two calls has drawn and keeps, such as a table, is the
+same in all workers, and as with `Inline`.
 """
 
 import collections
@@ -16,6 +22,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
 
 from torch_zerohess.evaluators.factory import Each, Factory
 from torch_zerohess.evaluators.process_identity import digest, is_worker
@@ -25,7 +32,7 @@ T = TypeVar("T")
 _DEPTH = 8
 _MOST = 10_000
 """Objects that are looked at, and parts of one object: a black box may hold a long list."""
-_PLAIN = str | bytes | int | float | torch.Tensor | None
+_PLAIN = str | bytes | int | float | Tensor | None
 """Types of objects that hold no generator."""
 _LIBRARIES = "torch", "numpy"
 """Packages whose classes and functions hold no generator but the global ones."""
@@ -33,37 +40,50 @@ _numbers = itertools.count()
 """Of seeds: an executor may send a black box again, as it was at first."""
 
 
-def draw_apart(fn: Callable[..., Any]) -> list[Any]:
-    """Give the generators that a black box uses seeds of this process, if it is a worker. A `Factory` is built first.
+class Apart:
+    """Calls of a black box, in a worker with random numbers of this process. A `Factory` is built first.
 
-    These are the generators of torch, NumPy and Python in what fn holds and in the global variables and modules that
-    its code names, and the three global ones. Others, as inside of a C++ library, are the black box's own affair.
-    Return these generators.
+    The generators that a black box holds are those of torch, NumPy and Python in what fn holds, and in the global
+    variables and modules that its code names. Others, as inside of a C++ library, are the black box's own affair.
     """
-    fn = _built(fn)
-    if not is_worker():
-        return []
-    torch.manual_seed(_next_seed() >> 1)  # on every device
-    found = [*_global_ones(), *_held_by(fn)]
-    for generator in found:
-        _reseed(generator)
-    return found
+
+    def __init__(self, fn: Callable[..., Any]) -> None:
+        self._fn = _built(fn)
+        self._waiting: list[Any] = []
+        """Generators that fn holds, and that no call has drawn from."""
+        self._called = not is_worker()
+        if is_worker():
+            torch.manual_seed(_next_seed() >> 1)  # on every device
+            for generator in _global_ones():
+                _reseed(generator)
+            self._waiting = _held_by(self._fn)
+
+    def call(self, evaluate: Callable[[], T], again: Callable[[], object] = lambda: None) -> T:
+        """Return evaluate(), a call of the black box, made again where a generator had to be seeded meanwhile.
+
+        A module that fn imports when it is first called may have a generator, too. Whether the first call has drawn
+        from it is not known. So the call is made again, to see.
+
+        again: called before each further evaluation.
+        """
+        while True:
+            waiting = [(one, _state(one)) for one in self._waiting]
+            result = evaluate()
+            drew = [one for one, before in waiting if not _same(_state(one), before)]
+            new = list[Any]()
+            if not self._called:
+                self._called = True
+                new = [one for one in _held_by(self._fn) if not _among(self._waiting, one)]
+            if not drew and not new:
+                return result
+            for generator in drew:
+                _reseed(generator)
+            self._waiting = [one for one in self._waiting if not _among(drew, one)] + new
+            again()
 
 
-def drawn_apart(fn: Callable[..., Any], known: list[Any], evaluate: Callable[[], T]) -> T:
-    """Return evaluate(), the first call of a black box here: the second where the first one brought generators.
-
-    A module that fn imports when it is called may have a generator. Its first numbers are the same in all workers.
-
-    known: what `draw_apart` returned.
-    """
-    result = evaluate()
-    if not is_worker():
-        return result
-    new = [one for one in _held_by(_built(fn)) if not any(one is other for other in known)]
-    for generator in new:  # not the one of NumPy: torch itself imports NumPy late, and then its seed is a random one
-        _reseed(generator)
-    return evaluate() if new else result
+def _among(things: list[Any], thing: Any) -> bool:
+    return any(one is thing for one in things)
 
 
 def _built(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -169,15 +189,38 @@ def _is_generator(thing: Any) -> bool:
     return numpy is not None and isinstance(thing, numpy.random.Generator | numpy.random.RandomState)
 
 
+def _state(generator: Any) -> Any:
+    """Return the state of a generator, None if it has none, as a generator of the operating system."""
+    with contextlib.suppress(Exception):
+        if isinstance(generator, torch.Generator):
+            return generator.get_state()
+        if isinstance(generator, random.Random):
+            return generator.getstate()
+        bits = getattr(generator, "bit_generator", None)
+        return generator.get_state(legacy=False) if bits is None else bits.state
+    return None
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Whether two states are equal; those of NumPy are dictionaries with arrays in them."""
+    if isinstance(first, Tensor):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return all(_same(one, second[key]) for key, one in first.items())
+    equal = first == second
+    return bool(equal.all()) if hasattr(equal, "all") else bool(equal)
+
+
 def _reseed(generator: Any) -> None:
     seed = _next_seed()
     if isinstance(generator, torch.Generator):
         generator.manual_seed(seed >> 1)
     elif isinstance(generator, random.Random):
         generator.seed(seed)
-    else:
-        bits = getattr(generator, "bit_generator", None) or generator._bit_generator
+    elif (bits := getattr(generator, "bit_generator", None)) is not None:
         bits.state = type(bits)(seed).state
+    else:  # normal numbers come in pairs, of which the second is a part of the state
+        generator.set_state(type(generator._bit_generator)(seed).state | {"has_gauss": 0, "gauss": 0.0})
 
 
 def _next_seed() -> int:

@@ -21,7 +21,7 @@ from torch_zerohess.evaluators.job import Job
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker
-from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
+from torch_zerohess.evaluators.random_numbers import Apart
 
 _LOOK = 0.05
 """Seconds after which a wait looks for calls that were submitted meanwhile."""
@@ -33,7 +33,7 @@ class Ray(Ahead):
     An actor keeps the black box from call to call, up to four of them, those that were used last. An actor that
     ends, with its process or its machine, is replaced by a new one, which makes the black box again. Its points are
     tried again, by the new one or by another. What becomes of points that failed too often: see `ProcessPool`. An
-    exception of the black box is raised here, also SystemExit.
+    exception of the black box is raised here, also SystemExit. Random numbers: see `ProcessPool`.
 
     An actor that cannot start, as on a machine without this package, is tried again as often as points are, and then
     given up with a warning. A call without any actor left raises RuntimeError; the next call tries all of them again.
@@ -198,8 +198,8 @@ class Actor:
     def __init__(self) -> None:
         torch.set_num_threads(1)
         become_worker()
-        self._kept: dict[Any, Any] = {}
-        """Black boxes by their references."""
+        self._kept: dict[Any, tuple[Any, Apart]] = {}
+        """Black boxes, and their calls, by their references."""
 
     def ready(self) -> None:
         """Do nothing, once the actor has started."""
@@ -213,13 +213,12 @@ class Actor:
 
         try:
             take_default_dtype(dtype)
-            if held[0] in self._kept:
-                return True, values_of(used(self._kept, held[0]), data)
-            make_room(self._kept)
-            fn = ray.get(held[0])
-            generators = draw_apart(fn)
-            self._kept[held[0]] = fn
-            return True, drawn_apart(fn, generators, functools.partial(values_of, fn, data))
+            if held[0] not in self._kept:
+                make_room(self._kept)
+                fn = ray.get(held[0])
+                self._kept[held[0]] = fn, Apart(fn)
+            fn, apart = used(self._kept, held[0])
+            return True, apart.call(functools.partial(values_of, fn, data))
         except BaseException as error:  # SystemExit too: Ray would end the actor
             if hasattr(error, "ray_terminate_msg"):  # Ray itself ends the actor
                 raise

@@ -1,12 +1,17 @@
 """What a black box returned, as a tensor with one value per point."""
 
+import itertools
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.returned import ReturnedTypeError, ReturnedValueError
+
+_SHOWN = 8
+"""Keys of a dictionary that a message names."""
 
 
 def stacked(rows: Any) -> Any:
@@ -62,6 +67,12 @@ def as_tensor(result: Any) -> Tensor:
     integers and truth values of any kind: counts, images of bytes, a loss that is 0 on a plateau. Masked entries of a
     NumPy array are NaN. Sparse tensors are filled.
     """
+    if isinstance(result, Mapping):
+        names = ", ".join(map(repr, itertools.islice(result, _SHOWN))) + (", ..." if len(result) > _SHOWN else "")
+        raise ReturnedTypeError(
+            f"fn must return one tensor [K, *out], got a {type(result).__name__} of {names or 'nothing'}: return one "
+            "of its values, or join them along dimension 1"
+        )
     try:
         result = stacked(result)
         if isinstance(result, Tensor):

@@ -1,11 +1,10 @@
 """What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
 
 import contextlib
-import functools
 import multiprocessing
 import pickle
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,10 +17,10 @@ from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
 from torch_zerohess.evaluators.process_identity import become_worker, in_this_process
-from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
+from torch_zerohess.evaluators.random_numbers import Apart
 from torch_zerohess.evaluators.values import checked_values
 
-READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
+READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR, AGAIN = range(7)
 """Kinds of messages: see `Messages`."""
 
 
@@ -39,6 +38,7 @@ class Messages:
     | VALUES | worker | None | values |
     | ROOM | worker, then caller | bytes | |
     | ERROR | worker | whether fn could not be made, and the error | |
+    | AGAIN | worker | None: it evaluates the points once more, see `Apart` | |
     """
 
     def __init__(self, connection: "Connection[Any, Any]") -> None:
@@ -69,17 +69,13 @@ class Messages:
 class Kept:
     """A black box of this process."""
 
-    def __init__(self, fn: Any) -> None:
-        self.fn = fn
-        self.generators: list[Any] | None = in_this_process(draw_apart, fn)
-        """None once it has been called."""
+    def __init__(self, fn: Any, again: Callable[[], None]) -> None:
+        self.fn, self.again = fn, again
+        self.apart: Apart = in_this_process(Apart, fn)
 
     def values(self, parts: Sequence[transfer.Part]) -> Tensor:
         """Return the values of points and auxiliary inputs."""
-        evaluate = functools.partial(self._values, parts)
-        values = evaluate() if self.generators is None else drawn_apart(self.fn, self.generators, evaluate)
-        self.generators = None
-        return values
+        return self.apart.call(lambda: self._values(parts), self.again)
 
     def _values(self, parts: Sequence[transfer.Part]) -> Tensor:
         tensors = [one.tensor() for one in parts]
@@ -111,7 +107,7 @@ def main(connection: "Connection[Any, Any]") -> None:
                 if kind == FUNCTION:
                     for one in gone:  # what they hold is given back before the next one is made
                         del kept[one]
-                    kept[number] = Kept(pickle.loads(parts[0].data))
+                    kept[number] = Kept(pickle.loads(parts[0].data), lambda: messages.send(AGAIN))
                 else:
                     values = kept[number].values(parts)
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's

@@ -14,7 +14,7 @@ from torch_zerohess.evaluators.default_dtype import default_dtype
 from torch_zerohess.evaluators.job import Job
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.lifetime import end_group, ending, started_worker
-from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
+from torch_zerohess.evaluators.worker import AGAIN, EVALUATE, FUNCTION, READY, ROOM, Messages
 
 
 class Process:
@@ -38,6 +38,8 @@ class Process:
         """What it evaluates."""
         self.job: Job | None = None
         """The call that the chunk is of."""
+        self.seconds: float | None = None
+        """How long the evaluation may take."""
         self.deadline: float | None = None
         self.evaluations = 0
 
@@ -64,7 +66,11 @@ class Process:
         parts = [one.rows(chunk.start, chunk.stop) for one in job.parts]
         used(self.kept, job.function.number)
         self.messages.send(EVALUATE, (default_dtype(), job.function.number), parts, shared=self._room(parts))
-        self.deadline = None if timeout is None else time.monotonic() + timeout * len(chunk)
+        self.seconds = None if timeout is None else timeout * len(chunk)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.deadline = None if self.seconds is None else time.monotonic() + self.seconds
 
     def forget(self) -> int | None:
         """Return the number of the black box that it got last, and could not make."""
@@ -78,10 +84,12 @@ class Process:
         kind, header, parts = self.messages.receive()
         if kind == ROOM:
             self._enlarge(header)
+        elif kind == AGAIN:
+            self._begin()
         elif kind != READY and self.chunk is not None:
             self.evaluations += len(self.chunk)
             self.chunk = self.job = self.deadline = None
-        self.ready = kind != ROOM
+        self.ready = kind not in (ROOM, AGAIN)
         return kind, header, parts
 
     def _room(self, parts: Sequence[transfer.Part]) -> bool:

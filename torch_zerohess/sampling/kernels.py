@@ -6,6 +6,9 @@ numbers with the reference. If they differ, or a kernel fails, a warning says so
 All other tensors go to the reference, and so do CPU tensors without the extension. All of them draw the same bits.
 Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most. Blocks of sampler
 "orthogonal" are made of such sums.
+
+The extension adds every sum in one order, whatever the number of threads. The BLAS, which takes more than MANY_VECTORS
+vectors and Hessians of more than _WIDE parameters, adds in another order with another number of threads.
 """
 
 import itertools
@@ -18,7 +21,7 @@ from torch import Tensor
 from torch_zerohess.sampling import extension, philox, proposals
 from torch_zerohess.sampling.on_cuda import by_triton, on_cuda
 
-MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
+MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector, or per eight of them
 _WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
 _STRIP = 128  # rows of a wide Hessian that one matrix product gives
 _CHUNK = 1 << 22  # elements of drawn rows held at a time

@@ -154,6 +154,10 @@ def test_a_program_that_ends_or_hangs_says_why(server, note):
         python(wrong + WRITES + "; time.sleep(60)", server=server, timeout=0.5)(Z)
     with pytest.raises(RuntimeError, match=r"ended with code 3 and without an answer(.|\n)*no licence"):
         python(wrong + "sys.exit(3)", server=server)(Z)
+    with pytest.raises(
+        RuntimeError, match=r"was killed by signal 15 \(SIGTERM\) and without an answer(.|\n)*no licence"
+    ):
+        python(wrong + "import os; os.kill(os.getpid(), 15)", server=server)(Z)
 
 
 TWICE = ANSWER.replace("print(json", "print(2 * (json").replace("), flush", ") + chr(10)), end='', flush")

@@ -18,7 +18,7 @@ from torch_zerohess import BlackBox, Memory, Smoothing, SparseBlackBox, estimate
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.heads import SquaredError
-from torch_zerohess.sampling import kernels, stein_sums
+from torch_zerohess.sampling import extension, kernels, stein_sums
 from truths import deviation, normal, spread, vector
 
 
@@ -316,7 +316,7 @@ def test_seed() -> None:
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize("outputs", [1, 20])
+@pytest.mark.parametrize("outputs", [1, 8, 20])
 @pytest.mark.parametrize(
     ("sampler", "samples", "stored"),
     [("random", 200, True), ("random", 200, False), ("sobol", 200, True), ("orthogonal", 40, True)],
@@ -324,6 +324,7 @@ def test_seed() -> None:
 def test_any_number_of_threads_gives_the_same_bits(
     sampler: str, samples: int, stored: bool, outputs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of more than 8 outputs, and of a wide Hessian, the same numbers but for rounding: the BLAS adds them."""
     if not stored:
         monkeypatch.setattr(perturbations, "STORED", 0)
     n = 500
@@ -339,13 +340,19 @@ def test_any_number_of_threads_gives_the_same_bits(
         (g,) = torch.autograd.grad(y, x, torch.ones_like(y), create_graph=True)
         (h,) = torch.autograd.grad(g, x, torch.ones_like(g))
         e = estimate(fn, x, smoothing, value="smoothed")
-        results = [y.detach(), g.detach(), h, e.value, e.gradient, e.hvp(torch.ones(n)), e.standard_error("gradient")]
+        results = [y.detach(), e.value, g.detach(), h, e.gradient, e.hvp(torch.ones(n)), e.standard_error("gradient")]
         return [*results, e.hessian_diagonal(), *([e.hessian()] if outputs == 1 else [])]
 
     before = torch.get_num_threads()
     try:
-        pairs = zip(derivatives(1), derivatives(2), strict=True)
-        assert not [number for number, (one, two) in enumerate(pairs) if not torch.equal(one, two)]
+        expected = derivatives(1)
+        exact = 2 if stored and (outputs > 8 or not extension.available) else 8
+        for threads in (2, 3, 8):
+            found = derivatives(threads)
+            for one, two in zip(expected[:exact], found[:exact], strict=True):
+                assert torch.equal(one, two)
+            for one, two in zip(expected[exact:], found[exact:], strict=True):
+                assert float((one - two).abs().max()) <= 1e-13 * float(one.abs().max())
     finally:
         torch.set_num_threads(before)
 

@@ -14,6 +14,7 @@ from layers import counting
 from scipy import integrate
 from torch import Tensor
 
+import torch_zerohess as zh
 from torch_zerohess import Smoothing, estimate
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
@@ -498,7 +499,57 @@ def test_an_estimate_is_not_mapped_over(seed: int | None) -> None:
 
     with pytest.raises(ValueError, match="x must not be mapped over by vmap"):
         torch.func.vmap(slope)(X)
-    assert not torch.func.grad(lambda x: (slope(x) + 0 * x).sum())(X[0]).any()
+
+
+def closed_box(z: Tensor, *aux: Tensor) -> Tensor:
+    return (z + sum(aux)).square().sum(1)
+
+
+SMOOTHING = Smoothing(sigma=0.1, samples=20, seed=0)
+ONE = spread(2, -1.0, 1.0)
+WITHOUT_GRAPH = {
+    "the value": lambda a: estimate(closed_box, a, SMOOTHING).value,
+    "the gradient": lambda a: estimate(closed_box, a, SMOOTHING).gradient[0],
+    "an auxiliary input": lambda a: estimate(closed_box, ONE, SMOOTHING, a).value,
+    "the vector of a product": lambda a: estimate(closed_box, ONE, SMOOTHING).hvp(a)[0],
+    "finite differences": lambda a: zh.finite_difference_hvp(closed_box, a, ONE, SMOOTHING)[0],
+    "the vector of finite differences": lambda a: zh.finite_difference_hvp(closed_box, ONE, a, SMOOTHING)[0],
+    "a sparse Jacobian": lambda a: zh.sparse_jacobian(torch.square, a, SMOOTHING).dense()[0, 0],
+    "a search": lambda a: zh.minimize(closed_box, a, sigma=1.0, max_evaluations=9, seed=0).x[0],
+}
+TRANSFORMS = {
+    "grad": torch.func.grad,
+    "jacrev": torch.func.jacrev,
+    "jacfwd": torch.func.jacfwd,
+    "jvp": lambda fn: lambda x: torch.func.jvp(fn, (x,), (x,)),
+    "hessian": torch.func.hessian,
+    "forward mode": lambda fn: (
+        lambda x: torch.autograd.functional.jacobian(fn, x, vectorize=True, strategy="forward-mode")
+    ),
+}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.parametrize("name", WITHOUT_GRAPH)
+def test_results_without_a_graph_are_not_differentiated(name: str, transform: str) -> None:
+    """They would be constants, with derivatives of zero."""
+    with pytest.raises(ValueError, match=r"^(x|x0|v|aux\[0\]) is differentiated, and .* has no graph: (use|pass) "):
+        TRANSFORMS[transform](WITHOUT_GRAPH[name])(ONE)
+
+
+@pytest.mark.parametrize("name", WITHOUT_GRAPH)
+def test_what_nobody_differentiates_may_be_estimated_inside_of_a_transform(name: str) -> None:
+    expected = WITHOUT_GRAPH[name](ONE)
+    found = []
+
+    def fn(x: Tensor) -> Tensor:
+        found.append(torch.func.debug_unwrap(WITHOUT_GRAPH[name](x.detach())))
+        found.append(WITHOUT_GRAPH[name](ONE))
+        return x.sum()
+
+    assert torch.equal(torch.func.grad(fn)(ONE), torch.ones_like(ONE))
+    assert all(torch.equal(one, expected) for one in found)
+    assert not WITHOUT_GRAPH[name](ONE.clone().requires_grad_()).requires_grad
 
 
 def test_a_head_that_returns_an_array_is_told_so() -> None:

@@ -301,6 +301,18 @@ def test_several_results_of_a_batch_are_refused(second: Any, count: int) -> None
     torch.testing.assert_close(got, torch.stack([X.sum()[None], X[:1].square()]))
 
 
+@pytest.mark.parametrize("vectorized", [True, False])
+def test_a_dictionary_is_several_results(vectorized: bool) -> None:
+    def named(z: Tensor) -> dict[str, Tensor]:
+        return {"image": z.square(), "depth": z}
+
+    message = r"^fn must return one tensor \[K, \*out\], got a dict of 'image', 'depth': return one of its values"
+    with pytest.raises(TypeError, match=message):
+        estimate(named, X, S, vectorized=vectorized)
+    with pytest.raises(TypeError, match=r"got a dict of 0, 1, 2, 3, 4, 5, 6, 7, \.\.\.: return"):
+        estimate(lambda z: dict(enumerate(z.mT.repeat(9, 1))), X, S)
+
+
 @pytest.mark.parametrize("kind", [torch.ones, np.ones])
 def test_rows_of_different_shapes_are_refused(kind: Callable[[int], Any]) -> None:
     message = r"got list: rows must have one shape, got \[3\] for row 1 and \[2\] before"

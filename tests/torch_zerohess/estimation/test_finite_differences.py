@@ -96,6 +96,29 @@ def test_evaluators_and_values_that_are_not_finite() -> None:
         zh.finite_difference_hvp(square, vector(0.3, -0.2), vector(1.0, 2.0), smoothing)
 
 
+def test_gradients_that_are_nearly_equal_are_not_rounded_before_their_difference() -> None:
+    """They are near 1e6 here, where neighbours in float32 are 0.06 apart; their difference is 0.03."""
+    x, v, smoothing = torch.zeros(2), torch.tensor([1.0, 0.0]), zh.Smoothing(sigma=0.05, samples=4000, seed=0)
+    products = [
+        zh.finite_difference_hvp(
+            lambda z, k=slope: k * z[:, 0].double() + z.double().square().sum(1) / 2, x, v, smoothing
+        )
+        for slope in (0.0, 1e6)
+    ]
+    assert float(products[1][0]) == pytest.approx(1.0, abs=0.1)
+    torch.testing.assert_close(products[1], products[0], rtol=1e-3, atol=1e-3)  # a slope has no curvature
+
+
+def test_a_product_beyond_the_type_of_x_is_named() -> None:
+    with pytest.raises(ValueError, match=r"the product with the Hessian is not finite in torch\.float32"):
+        zh.finite_difference_hvp(
+            lambda z: 1e30 * z.double().square().sum(1),
+            torch.zeros(1),
+            1e20 * torch.ones(1),
+            zh.Smoothing(sigma=0.5, seed=0),
+        )
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     """The step is below the distance of neighbouring numbers of bfloat16 at 100."""

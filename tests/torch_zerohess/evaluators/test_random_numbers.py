@@ -1,20 +1,24 @@
-"""Workers draw different random numbers, wherever the black box keeps its generators."""
+"""Workers draw different random numbers, wherever the black box keeps its generators, and change no fixed ones."""
 
 import concurrent.futures
 import functools
 import multiprocessing
+import pickle
 import random
 import sys
 import types
 
 import black_boxes
+import cloudpickle
 import numpy as np
 import pytest
 import torch
 
-from torch_zerohess.evaluators import Executor, Factory, random_numbers
+from torch_zerohess.evaluators import Executor, Factory, Inline, ProcessPool, random_numbers
+from torch_zerohess.evaluators import executor as executor_module
 from torch_zerohess.evaluators.factory import Each
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import Apart
+from torch_zerohess.evaluators.worker_process import Process
 
 Z = torch.zeros(6, 1, dtype=torch.float64)
 KINDS = {
@@ -31,6 +35,14 @@ BOXES = {
     "a module that is imported late": black_boxes.noisy_late,
     "the generator of NumPy": Factory(black_boxes.seeded),
     "one point": Each(black_boxes.noisy_of_one),
+    "pairs of numbers": black_boxes.Paired(),
+    "from the third call on": black_boxes.AfterAWhile(),
+}
+FIXED = {
+    "a copy in every call": black_boxes.Common,
+    "a copy of one that is imported late": lambda: black_boxes.common_late,
+    "a table of the first call": black_boxes.Tabulated,
+    "a seed in every call": black_boxes.Restarted,
 }
 
 
@@ -51,6 +63,36 @@ def test_workers_of_a_pool_draw_different_numbers(name, pool):
 def test_workers_of_an_executor_draw_different_numbers(name, executor):
     values = torch.cat([executor(BOXES[name], Z) for _ in range(3)])
     assert len(values.unique()) == len(values)
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_workers_leave_fixed_random_numbers_as_they_are(name, pool, executor):
+    points = black_boxes.points(12, 1)
+    expected = Inline()(FIXED[name](), points)
+    for workers in (pool, executor):
+        fn = FIXED[name]()
+        for _ in range(2):
+            assert torch.equal(workers(fn, points), expected)
+
+
+def test_the_time_of_an_evaluation_that_is_made_again_begins_anew(monkeypatch):
+    begun, begin = [], Process._begin
+    monkeypatch.setattr(Process, "_begin", lambda one: (begin(one), begun.append(one.deadline)))
+    with ProcessPool(1, timeout=1e6) as pool:
+        pool(black_boxes.Noisy(), Z[:3])
+    assert len(begun) == 4
+    assert begun == sorted({*begun})
+
+
+def test_an_executor_knows_a_black_box_with_a_generator_again():
+    """The pickled form of a generator has an address in it. What it holds is not told from the same black box."""
+    fn, kept = black_boxes.Noisy(), []
+    for pickler in (pickle.Pickler, cloudpickle.Pickler):
+        first = executor_module._state(fn, pickler)
+        kept.append(fn.generator.get_state())  # which takes the address
+        assert first == executor_module._state(fn, pickler) != b""
+        fn(Z)
+        assert executor_module._state(fn, pickler) != first
 
 
 def state(generator):
@@ -133,19 +175,44 @@ def boxes_with(generator):
     ]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_way_to_a_generator_is_found(monkeypatch, kind):
+def drawn(generator):
+    """Draw a number of a generator of any kind, as a black box does."""
+    if isinstance(generator, torch.Generator):
+        return float(torch.rand((), generator=generator))
+    return generator.random()
+
+
+def calls_of(fn, *generators, times=1):
+    """Return what the evaluations of some calls draw in a worker."""
+    values = []
+    apart = Apart(fn)
+    for _ in range(times):
+        apart.call(lambda: values.append([drawn(one) for one in generators]))
+    return values
+
+
+@pytest.fixture
+def as_worker(monkeypatch):
     monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
     monkeypatch.setattr(random_numbers, "_global_ones", list)
     before = torch.get_rng_state()
-    for fn in boxes_with(generator := KINDS[kind]()):
-        earlier = state(generator)
-        draw_apart(fn)
-        assert state(generator) != earlier, fn
-        later = state(generator)
-        draw_apart(lambda z: z)  # has none
-        assert state(generator) == later
+    yield
     torch.set_rng_state(before)
+
+
+@pytest.mark.usefixtures("as_worker")
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_way_to_a_generator_is_found(kind):
+    first = drawn(KINDS[kind]())
+    for number, fn in enumerate(boxes_with(KINDS[kind]())):
+        fn = boxes_with(generator := KINDS[kind]())[number]
+        values = calls_of(fn, generator, times=2)
+        assert values[0] == [first], fn  # as in every other process
+        assert len(values) == 3, fn  # the first call again, and the second
+        again = KINDS[kind]()
+        expected = [drawn(again) for _ in range(3)]
+        assert values[1][0] not in expected, fn
+        assert values[2][0] not in expected, fn
 
 
 @pytest.mark.parametrize(
@@ -166,33 +233,65 @@ def test_generators_of_modules_that_a_function_imports_are_found(monkeypatch, li
     assert random_numbers._held_by(names["late"]) == [module.rng]
 
 
-def test_the_first_call_is_made_again_only_for_a_generator_of_the_black_box(monkeypatch):
-    """Torch imports NumPy late, which has a generator with a random seed."""
-    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
-    calls, generator = [], KINDS["torch"]()
-    for fn, known, count in ((print, [], 1), (Slotted(generator), [generator], 1), (Slotted(generator), [], 2)):
+@pytest.mark.usefixtures("as_worker")
+def test_a_call_is_made_again_only_where_a_generator_of_the_black_box_was_drawn_from():
+    generator, calls = KINDS["torch"](), []
+    apart, again = Apart(Slotted(generator)), []
+
+    def call(draws):
         calls.clear()
-        random_numbers.drawn_apart(fn, known, lambda: calls.append(1))
+        again.clear()
+        apart.call(lambda: calls.append(drawn(generator) if draws else 0), lambda: again.append(1))
+        assert len(again) == len(calls) - 1
+        return len(calls)
+
+    assert [call(one) for one in (False, False, True, True, False)] == [1, 1, 2, 1, 1]
+
+
+@pytest.mark.usefixtures("as_worker")
+def test_a_generator_that_comes_with_the_first_call_is_waited_for():
+    """Whether the first evaluation has drawn from it is not known. A box that makes one in every call ends, too."""
+    for draws, count in ((False, 2), (True, 3)):
+        box, calls = Slotted(None), []
+        box.rng = None
+
+        def evaluate(box=box, calls=calls, draws=draws):
+            box.rng = box.rng or KINDS["torch"]()
+            calls.append(drawn(box.rng) if draws else 0)
+
+        Apart(box).call(evaluate)
         assert len(calls) == count
+    box, calls = Slotted(None), []
+
+    def evaluate_anew():
+        box.rng = KINDS["torch"]()
+        calls.append(drawn(box.rng))
+
+    Apart(box).call(evaluate_anew)
+    assert len({*calls}) == 1
+
+
+@pytest.mark.usefixtures("as_worker")
+def test_a_generator_without_a_state_is_left_alone():
+    generator = random.SystemRandom()
+    assert len(calls_of(Slotted(generator), generator)) == 1
 
 
 def test_generators_here_stay_as_they_are():
     generator = KINDS["torch"]()
     before = state(generator), torch.get_rng_state(), random.getstate(), repr(np.random.get_state())
     for fn in boxes_with(generator):
-        draw_apart(fn)
+        Apart(fn).call(lambda: None)
     assert state(generator) == before[0]
+    assert len(calls_of(Slotted(generator), generator)) == 1
     assert torch.equal(torch.get_rng_state(), before[1])
     assert (random.getstate(), repr(np.random.get_state())) == before[2:]
 
 
-def test_two_generators_of_one_black_box_stay_different(monkeypatch):
-    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
-    monkeypatch.setattr(random_numbers, "_global_ones", list)
-    before = torch.get_rng_state()
+@pytest.mark.usefixtures("as_worker")
+def test_two_generators_of_one_black_box_stay_different():
     pair = [torch.Generator().manual_seed(k) for k in (0, 1)]
-    draw_apart(functools.partial(max, pair))
-    torch.set_rng_state(before)
+    calls_of(functools.partial(max, pair), *pair)
     assert state(pair[0]) != state(pair[1])
 
 
@@ -209,11 +308,10 @@ def test_without_numpy(monkeypatch):
     for name in [one for one in sys.modules if one.partition(".")[0] == "numpy"]:
         monkeypatch.delitem(sys.modules, name)
     before, generator = (torch.get_rng_state(), random.getstate()), KINDS["torch"]()
-    earlier = state(generator)
-    draw_apart(functools.partial(print, generator))
+    values = calls_of(functools.partial(print, generator), generator)
     torch.set_rng_state(before[0])
     random.setstate(before[1])
-    assert state(generator) != earlier
+    assert len(values) == 2
 
 
 class Lazy(dict):

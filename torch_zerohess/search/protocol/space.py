@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import own_copy
-from torch_zerohess.estimation.inputs import working
+from torch_zerohess.estimation.inputs import check_no_derivative, working
 
 
 class Array(Protocol):
@@ -97,6 +97,7 @@ def checked_start(x0: Any) -> Tensor:
             raise ValueError(f"x0 must be a tensor, an array or a list of n numbers, got {x0!r}") from error
     elif not x0.is_floating_point() and not x0.is_complex():
         x0 = x0.double()
+    check_no_derivative("what a search finds has no graph: pass x0.detach()", x0=x0)
     x0 = working(x0)
     if x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
         raise ValueError(f"x0 must be a tensor [n], float32 or float64, got one of shape {[*x0.shape]}, {x0.dtype}")

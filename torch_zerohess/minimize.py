@@ -1,5 +1,7 @@
 """Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
+from __future__ import annotations  # signatures print names of types, not what they stand for
+
 import difflib
 import inspect
 import os

@@ -41,6 +41,7 @@ def plane(mi):
     """A matt square before a sky of radiance (0.5, 1, 2)."""
     return {
         "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
         "sensor": camera(mi),
         "plane": {
             "type": "rectangle",

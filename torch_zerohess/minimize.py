@@ -1,5 +1,7 @@
 """Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
+from __future__ import annotations  # signatures print names of types, not what they stand for
+
 import difflib
 import inspect
 import os
@@ -154,7 +156,8 @@ def minimize(
     last checkpoint is written, or while workers end, returns it, too. An exception of fn, loss or callback passes, with
     the `Minimum` so far as its attribute `minimum`. From Python 3.11 on a note says at which points fn was. Ctrl-C and
     exceptions keep, also in the checkpoint, the points of an interrupted batch whose values are known: with
-    `vectorized=False`, or from an evaluator. Where all values are equal the message says so.
+    `vectorized=False`, or from an evaluator. Where all values are equal the message says so, and a `UserWarning` after
+    50 evaluations.
 
     Example:
         >>> import torch

@@ -1,6 +1,8 @@
 """What `minimize` refuses: the error names the argument and its value, and comes before the first evaluation."""
 
+import inspect
 import math
+import typing
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from searches import tilted, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators import ProcessPool
+from torch_zerohess.search.protocol.space import Bounds
 
 TWO_WAYS = (
     r"can be read in two ways, got .*: write \[\(-1, 1\), \(0, 9\)\] if each parameter has a pair, "
@@ -180,3 +183,13 @@ def test_points_whose_values_differ_in_shape_are_named():
 def test_many_parameters_are_no_number_in_the_text():
     found = zh.minimize(lambda z: z.square().sum(1), zeros(10) + 1.0, sigma=1.0, max_evaluations=30, seed=0)
     assert repr(found).startswith("Minimum(x of shape [10], value=")
+
+
+@pytest.mark.parametrize("door", [zh.minimize, zh.optim.TrustRegion, zh.optim.Descent, zh.optim.LocalGaussNewton])
+def test_signatures_name_types_and_do_not_spell_them_out(door):
+    """`help` begins with the signature. The types can still be found by their names."""
+    said = str(inspect.signature(door))
+    assert "Bounds" in said
+    assert "Array" not in said
+    hints = typing.get_type_hints(door if door is zh.minimize else door.__init__)
+    assert hints["bounds"] == Bounds | None

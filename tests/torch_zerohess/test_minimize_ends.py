@@ -277,6 +277,63 @@ def test_a_total_plateau_is_said(bounds):
     assert torch.equal(fit.x, zeros(3)), "no other point is better"
 
 
+def square(y):
+    return y.square().mean()
+
+
+@pytest.mark.parametrize(
+    ("fn", "loss", "said"),
+    [
+        (
+            lambda z: torch.ones(len(z)),
+            None,
+            r"all 5\d values are equal so far: enlarge sigma, or check that x changes",
+        ),
+        (lambda z: torch.zeros(len(z), 3), square, r"all 5\d outputs are equal so far: enlarge sigma, or check that x"),
+        (
+            lambda z: z,
+            lambda y: 0.0 * y.sum(),
+            r"all 5\d values are equal so far, although outputs differ: .* that loss",
+        ),
+    ],
+    ids=["values", "outputs", "losses of outputs that differ"],
+)
+def test_fifty_equal_values_are_a_warning_and_the_search_goes_on(fn, loss, said):
+    settings = {"sigma": 1.0, "seed": 0, "loss": loss}
+    zh.minimize(fn, zeros(2), max_evaluations=49, **settings)  # a warning is an error
+    with pytest.warns(UserWarning, match=said) as noted:
+        fit = zh.minimize(fn, zeros(2), max_evaluations=120, **settings)
+    assert len(noted) == 1
+    assert noted[0].filename == __file__
+    assert fit.evaluations == 120
+
+
+def test_fortynine_equal_values_are_none():
+    values = iter([1.0] * 49 + [1.0 + 2.0**-52] + [1.0] * 100)
+    fit = zh.minimize(
+        lambda z: next(values), zeros(2), sigma=1.0, seed=0, vectorized=False, max_evaluations=90, noise=0
+    )
+    assert fit.evaluations == 90
+
+
+@pytest.mark.parametrize("target", [None, 0.0])
+def test_outputs_that_never_change_are_named_where_the_loss_is_zero_from_the_start(target):
+    settings = {"sigma": 1.0, "seed": 0, "loss": square, "max_evaluations": 40, "target": target}
+    fit = zh.minimize(lambda z: torch.zeros(len(z), 3), zeros(2), **settings)
+    assert fit.message.endswith(f"all {fit.evaluations} outputs are equal: enlarge sigma, or check that x changes fn")
+    changed = zh.minimize(lambda z: z.sign() * torch.zeros(3)[:2], zeros(2), **settings)
+    assert "outputs" in changed.message  # 0 and -0 are equal
+    other = zh.minimize(lambda z: z, zeros(2), **{**settings, "loss": lambda y: 0.0 * y.sum()})
+    assert "outputs" not in other.message
+
+
+def test_outputs_before_a_checkpoint_are_not_known(tmp_path):
+    settings = {"sigma": 1.0, "seed": 0, "loss": square, "checkpoint": tmp_path / "search.pt"}
+    for most, known in ((20, True), (40, False)):
+        fit = zh.minimize(lambda z: torch.ones(len(z), 3), zeros(2), max_evaluations=most, **settings)
+        assert fit.message.endswith("that x changes fn" if known else "all 40 values are equal: enlarge sigma")
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_history_has_every_point_and_value_in_order(dtype):
     seen = []

@@ -17,7 +17,6 @@ Example: where is the ball, and how bright is it? The points are [K, 3]: two len
 """
 
 import copy
-import difflib
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +28,8 @@ from torch import Tensor
 
 from torch_zerohess.adapters.mitsuba_description import Description, described, loaded
 from torch_zerohess.adapters.mitsuba_film import resize
-from torch_zerohess.adapters.mitsuba_parameters import Parameter, plain
+from torch_zerohess.adapters.mitsuba_parameters import Parameter, check_known, plain
+from torch_zerohess.adapters.mitsuba_sensors import Sensor, check_rendered, chosen
 from torch_zerohess.adapters.mitsuba_transforms import Transform
 from torch_zerohess.adapters.mitsuba_values import Value
 from torch_zerohess.adapters.mitsuba_variants import select_variant
@@ -40,6 +40,8 @@ __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
 
 _MOST = 2**31
 """Mitsuba's integers are below this."""
+_APART = 0x3C6EF373
+"""Between the seeds of two views: seeds of further calls follow each other."""
 
 
 class MitsubaScene:
@@ -66,6 +68,9 @@ class MitsubaScene:
             `focal_length`. The axis is not known, and taken to be x, for a sensor that was loaded before, and for an
             XML file with a Mitsuba before 3.7.
         spp: samples per pixel, at least 1; None keeps the number of the scene.
+        sensor: what is rendered: a name or a number of a sensor, in the order of the scene; or a list of several. Then
+            an evaluation renders each of them, images are [K, views, height, width, channels], and their films have one
+            size. Each view has noise of its own.
         depth: longest path, with the integrator `path` in place of the scene's integrator: 2 is direct light.
         integrator: dictionary for `load_dict`, in place of the scene's integrator.
         seed: of the renders, at least 0.
@@ -74,7 +79,8 @@ class MitsubaScene:
             repeat each other's noise, and it is not reproducible from `seed`. With "call" every worker's part of a
             batch has its own noise, since each part is a call. A process of one's own making has the seeds that follow
             `seed`: give each another one.
-        loss: of an image [height, width, channels] tensor, a scalar: the black box then returns losses.
+        loss: of an image [height, width, channels] tensor, or of [views, height, width, channels], a scalar: the black
+            box then returns losses.
         nan: "raise" refuses pixels that are not finite; "keep" leaves them to what receives them, see `on_nonfinite`
             of `BlackBox`.
         variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of one.
@@ -84,9 +90,11 @@ class MitsubaScene:
 
     Raises:
         ValueError: an argument out of its range, bounds outside what the scene accepts, a film for a scene with a crop
-            window, or a name that the scene does not have; the message has those that are near.
+            window, films of several sizes, a parameter of a sensor that is not rendered, or a name that the scene does
+            not have; the message has those that are near.
         FileNotFoundError: the XML file or a texture does not exist.
-        RuntimeError: the variant does not work here, or Mitsuba refuses the scene.
+        RuntimeError: the variant does not work here, Mitsuba refuses the scene, or the scene has no sensor, or no
+            integrator while neither depth nor integrator is given.
         ModuleNotFoundError: Mitsuba is not installed.
     """
 
@@ -99,6 +107,7 @@ class MitsubaScene:
         *,
         film: tuple[int, int] | None = None,
         spp: int | None = None,
+        sensor: Sensor | Sequence[Sensor] = 0,
         depth: int | None = None,
         integrator: Mapping[str, Any] | None = None,
         seed: int = 0,
@@ -125,11 +134,12 @@ class MitsubaScene:
             integrator = {"type": "path", "max_depth": depth, "rr_depth": depth}
         self.integrator: Any = None if integrator is None else self.mi.load_dict(dict(integrator))
         """None for the integrator of the scene."""
-        known = list(self.values.keys())
+        if self.integrator is None and self.scene.integrator() is None:
+            raise RuntimeError("the scene has no integrator: give depth=, for paths of this length, or integrator=")
+        self._sensors, self._several = chosen(self.scene, sensor), not isinstance(sensor, (int, str))
         for parameter in parameters:
-            for name in parameter.names:
-                if name not in known:
-                    raise ValueError(_unknown(name, known))
+            check_known(parameter.names, list(self.values.keys()))
+            check_rendered(self.mi, self.scene, self.values, self._sensors, parameter.names)
         self.parameters = tuple(parameter.bind(self.mi, self.values) for parameter in parameters)
         names = [name for one in self.parameters for name in one.names]  # a mesh that moves changes its normals, too
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -151,7 +161,7 @@ class MitsubaScene:
         self._lock = threading.RLock()  # from the writing of a point to the end of its render
 
     def __repr__(self) -> str:
-        width, height = (int(one) for one in self.scene.sensors()[0].film().size())
+        width, height = (int(one) for one in self._sensors[0].film().size())
         settings = f"film=({width}, {height}), spp={self.spp}, noise={self.noise!r}, variant={self.variant!r}"
         some = ", ".join(self.labels[:4]) + ", ..." * (self.n > 4)
         return f"MitsubaScene(n={self.n}, parameters=[{some}], {settings})"
@@ -245,8 +255,12 @@ class MitsubaScene:
             if self.noise == "point":
                 self._calls += 1
                 seed = self._fresh()
-            pixels = self.mi.render(self.scene, integrator=self.integrator, seed=seed, **more)
-            image = np.array(pixels, dtype=np.float32)
+            views = []
+            for number, sensor in enumerate(self._sensors):
+                own = (seed + number * _APART) % _MOST
+                pixels = self.mi.render(self.scene, sensor=sensor, integrator=self.integrator, seed=own, **more)
+                views.append(np.array(pixels, dtype=np.float32))
+        image = np.stack(views) if self._several else views[0]
         if self.nan == "raise" and not np.isfinite(image).all():
             wrong = np.argwhere(~np.isfinite(image))
             where = x.tolist() if self.n < 20 else "[...]"
@@ -255,12 +269,6 @@ class MitsubaScene:
                 f'at row {wrong[0][0]}, column {wrong[0][1]}; nan="keep" leaves them to on_nonfinite of BlackBox'
             )
         return torch.from_numpy(image)
-
-
-def _unknown(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-    near += [key for key in known if key.split(".")[0] == name.split(".")[0] and key not in near][:3]
-    return f"the scene has no parameter {name!r}; near ones: {', '.join(near) or ', '.join(known[:8])}"
 
 
 def _check(

@@ -1,5 +1,6 @@
 """What a parameter of a Mitsuba scene is, and what transforms and values have in common."""
 
+import difflib
 import math
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -36,6 +37,17 @@ class Parameter(Protocol):
 
     def bind(self, mi: Any, values: Any) -> Bound:
         """Look the parameter up in a scene that has its names."""
+
+
+def check_known(names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ValueError for a name that the scene does not have, with names that are near."""
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+            near += [key for key in known if key.split(".")[0] == name.split(".")[0] and key not in near][:3]
+            raise ValueError(
+                f"the scene has no parameter {name!r}; near ones: {', '.join(near) or ', '.join(known[:8])}"
+            )
 
 
 def assign(values: Any, name: str, value: Any) -> None:

@@ -1,6 +1,8 @@
 """A layer whose derivatives are a sparse smoothed Jacobian, estimated from its own evaluations."""
 
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,7 +15,7 @@ from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.evaluation import evaluate_center
 from torch_zerohess.estimation.inputs import checked_input, working
-from torch_zerohess.estimation.sparse_jacobian import check_output, sparse_jacobian
+from torch_zerohess.estimation.sparse_jacobian import check_output, estimated
 from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
@@ -87,6 +89,7 @@ class SparseBlackBox(Layer):
         self.call = BlackBoxCall(fn, vectorized, evaluator, on_nonfinite=on_nonfinite)
         self.settings: dict[str, Any] = {"keep": keep, "rate": rate, "grid": grid}
         self.jacobians = []
+        self._warned = False
 
     def forward(self, x: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n]; an empty batch needs a call with derivatives before it."""
@@ -112,23 +115,17 @@ class SparseBlackBox(Layer):
 
     def _jacobians(self, points: Tensor, shape: Sequence[int]) -> list[SparseJacobian]:
         """Return the Jacobian at every point [B, n] of outputs of a shape; each begins with what was found last."""
-        call = self.call
+        call = replace(self.call, value="smoothed")
         known = self.jacobians[-1] if self.jacobians else None
         if known is not None and (known.n, tuple(known.shape)) != (points.shape[1], tuple(shape)):
             known = None
-        found: list[SparseJacobian] = []
+        found, doubt = list[SparseJacobian](), ""
         for point in points:
-            known = sparse_jacobian(
-                call.fn,
-                point,
-                self.smoothing,
-                previous=known,
-                vectorized=call.vectorized,
-                evaluator=call.evaluator,
-                on_nonfinite=call.on_nonfinite,
-                **self.settings,
-            )
+            known, doubt = estimated(call, point, self.smoothing, self.settings, known)
             found.append(known)
+        if doubt and not self._warned:  # of the last element, which begins with what the others have found
+            self._warned = True
+            warnings.warn(doubt, UserWarning, stacklevel=2)
         return found
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The smoothed Jacobian of an output whose elements depend on few parameters each, from one batch of evaluations."""
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +21,12 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _COUNTING = 0.5
 """Share of the samples that counts in any fit: weights of "aggregate" leave more than this."""
+_LEAST = 0.05
+"""`explained`, below which a Jacobian is useless: without noise its error is at least 97 % of its length."""
+_OF_DENSE = 0.5
+"""The same as a share of `explained_dense`. Where both are exact but for noise, they are nearly equal."""
+_ROUNDING = 8 * torch.finfo(torch.float32).eps
+"""Changes that are no larger than this share of the outputs may be rounding: there is nothing to explain."""
 
 
 def sparse_jacobian(
@@ -75,6 +82,9 @@ def sparse_jacobian(
     kept entries need. ValueError too if the weights of "uniform" leave too few samples that count, as they do in more
     than a few dimensions.
 
+    Warns (UserWarning) if outputs change and the Jacobian is useless: `explained` is below 0.05 or below half of
+    `explained_dense`.
+
     `standard_error` of the result allows for residuals whose variance depends on the perturbation, as it does for
     curved and for noisy fn. With few samples and strong curvature it is too small.
 
@@ -89,25 +99,57 @@ def sparse_jacobian(
         >>> J.evaluations, J.explained > 0.9, bool((seen - 1 / 9).abs().max() < 0.01)
         (200, True, True)
     """
+    found, doubt = estimated(
+        BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite),
+        x,
+        smoothing,
+        {"keep": keep, "rate": rate, "grid": grid},
+        previous,
+    )
+    if doubt:
+        warnings.warn(doubt, UserWarning, stacklevel=2)
+    return found
+
+
+def estimated(
+    call: BlackBoxCall, x: Tensor, smoothing: Smoothing, given: Mapping[str, Any], previous: SparseJacobian | None
+) -> tuple[SparseJacobian, str]:
+    """Return the Jacobian of `sparse_jacobian`, and why it is useless; "" if it is not.
+
+    `given` are keep, rate and grid. The value of the call is "smoothed": f(x) itself is not evaluated.
+    """
     check_smoothing(smoothing)
     check_no_derivative("a sparse Jacobian has no graph: use SparseBlackBox", x=checked_input(x))
     x = x.detach()
     if x.ndim != 1:
         raise ValueError(f"x must be one point [n], got {list(x.shape)}")
     smoothing = _resolved(smoothing, len(x))
-    settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True, compared=True)
+    settings = replace(SparseSettings.checked(len(x), **given), prune=True, compared=True)
     check_samples(smoothing.samples, settings.keep)
-    call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
     work = working(x)
     taken = previous.total_evaluations if isinstance(previous, SparseJacobian) else 0
-    u, changes, weights, shape, evaluations = _sampled(call, work, smoothing, smoothing.drawn_seed(taken))
+    u, changes, weights, shape, evaluations, size = _sampled(call, work, smoothing, smoothing.drawn_seed(taken))
     check_samples(smoothing.samples, settings.keep, smoothing.samples - len(u))
     _check_weights(weights, smoothing, settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
     earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)
     with without_autocast(work.device):
         found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
-    return replace(found.times(1.0 / sigma), evaluations=evaluations, total_evaluations=taken + evaluations)
+    varies = float(changes.abs().max()) > _ROUNDING * size
+    doubt = _doubt(found, smoothing.samples) if varies else ""
+    return replace(found.times(1.0 / sigma), evaluations=evaluations, total_evaluations=taken + evaluations), doubt
+
+
+def _doubt(found: SparseJacobian, samples: int) -> str:
+    """Return why the Jacobian of an output that changes is useless; "" if it is not."""
+    if found.explained >= max(_LEAST, _OF_DENSE * found.explained_dense):
+        return ""
+    explained, dense = max(found.explained, 0.0), max(found.explained_dense, 0.0)
+    return (
+        f"explained = {explained:.2f} of the changes of the outputs, a dense Jacobian explains {dense:.2f}: the sparse "
+        "Jacobian is useless, because the outputs depend on many parameters, or on none and have noise; take more "
+        f"samples than {samples}, or BlackBox"
+    )
 
 
 def check_output(shape: torch.Size, other: str) -> None:
@@ -139,8 +181,11 @@ def _resolved(smoothing: Smoothing, n: int) -> Smoothing:
 
 def _sampled(
     call: BlackBoxCall, x: Tensor, smoothing: Smoothing, seed: int
-) -> tuple[Tensor, Tensor, Tensor, torch.Size, int]:
-    """Return perturbations [S, n] in units of sigma, changes [S, m], weights [S], the shape [*out], evaluations."""
+) -> tuple[Tensor, Tensor, Tensor, torch.Size, int, float]:
+    """Return perturbations [S, n] in units of sigma, changes [S, m], weights [S], the shape [*out], evaluations.
+
+    The last is the largest magnitude of an output.
+    """
     perturbations = perturb(x[None], smoothing, seed, keep=True)
     stein = perturbations.stein
     assert isinstance(stein, LikelihoodRatio)
@@ -152,6 +197,7 @@ def _sampled(
     why = call.why_lost(points.shape[1])
     values, kept = finite_values(values, values, lambda: points, call.on_nonfinite, len(u), smoothing, stein, why)
     flat = values[0].reshape(len(u), -1).double()
+    size = float(flat.abs().max())
     if smoothing.antithetic:
         S = len(u) // 2
         flat, u, weights = 0.5 * (flat[:S] - flat[S:]), u[:S], weights[:S]
@@ -160,7 +206,7 @@ def _sampled(
     if kept is not None:
         some = kept[0, : len(u)]
         flat, u, weights = flat[some], u[some], weights[some]
-    return u, flat, weights, shape, len(points[0])
+    return u, flat, weights, shape, len(points[0]), size
 
 
 def _check_weights(weights: Tensor, smoothing: Smoothing, keep: int) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 
 from torch_zerohess.minimization.callback import Callback
+from torch_zerohess.minimization.constant import warn_of_constant
 from torch_zerohess.minimization.failure import failure
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.outcome import outcome
@@ -42,6 +43,7 @@ def run(running: Running, stopping: Stopping, callback: Callback | None, black_b
 
 def _end(running: Running, stopping: Stopping, callback: Callback | None) -> End:
     """Step until the search ends, and decide in noise which point is the best one."""
+    seen = running.record.complete
     while True:
         running.look_again()
         end = stopping.reason(running)
@@ -51,6 +53,8 @@ def _end(running: Running, stopping: Stopping, callback: Callback | None) -> End
             end = "callback", "the callback asked to end"
         if end is None:
             running.step()
+            warn_of_constant(running.record, seen)
+            seen = running.record.complete
             continue
         if end[0] != "time":
             running.decide()

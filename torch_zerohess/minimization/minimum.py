@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import named
+from torch_zerohess.minimization.covariance import covariance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,6 +98,27 @@ class Minimum:
     def history(self) -> list[Observation]:
         """Every point and its loss, in order: x [n], a row of `points`, and value, a float."""
         return [Observation(x, value) for x, value in zip(self.points, self.values.tolist(), strict=True)]
+
+    def covariance(self) -> Tensor:
+        """Return the covariance of the parameters in the Laplace approximation, the inverse of `hessian` [n, n].
+
+        The loss must be the negative logarithm of the likelihood, or of the posterior density. For residuals r with
+        independent Gaussian errors of standard deviation s it is sum(r^2 / s^2) / 2. The standard deviations of the
+        parameters are the roots of the diagonal. An error d of H_ii, from `standard_errors`, changes variance i by the
+        share d C_ii, to first order.
+
+        Raises ValueError if the Hessian is not known, or if it is not positive definite within its errors.
+
+        Example:
+            >>> from torch_zerohess import minimize
+            >>> loss = lambda z: 0.5 * (z / torch.tensor([1.0, 3.0])).square().sum(1)
+            >>> fit = minimize(loss, [1, 1], sigma=1.0, seed=0)
+            >>> [round(one, 3) for one in fit.covariance().diagonal().sqrt().tolist()]
+            [1.0, 3.0]
+        """
+        if self.hessian is None or self.standard_errors is None:
+            raise ValueError("the Hessian is not known, too few evaluations lie around x: give more max_evaluations")
+        return covariance(self.hessian, self.standard_errors["hessian_diagonal"])
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the loss of every evaluation, and the lowest so far as a line, and return the axes.

@@ -35,6 +35,7 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
             flat=not running.noise and search.untouched is None and is_flat(around, search.unit),
             measuring=running.needed_for_noise,
             failed=int((~torch.isfinite(losses)).sum()),
+            same_outputs=running.record.same_outputs,
         ),
         engine=search.engine,
         success=success,

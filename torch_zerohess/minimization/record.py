@@ -41,6 +41,10 @@ class Record:
         """Whether the outputs of further requests are kept."""
         self._outputs = [x0.new_empty(0, 0)]
         """Of the last complete evaluations [k, *out], in batches."""
+        self._first: Tensor | None = None
+        """The first output [*out]."""
+        self._same = True
+        """Whether all outputs are known to be equal to it."""
 
     @property
     def known(self) -> int:
@@ -84,6 +88,10 @@ class Record:
         if missing:
             numbers, values, error = self._call(points[missing])
             if numbers:
+                self._first = values[0].clone() if self._first is None else self._first
+                self._same = (
+                    self._same and values.shape[1:] == self._first.shape and bool((values == self._first).all())
+                )
                 self._values = torch.cat([self._values, values]) if self._numbers else values
                 self._numbers += [missing[k] for k in numbers]
             if error is not None:
@@ -136,6 +144,16 @@ class Record:
         return bool((losses == losses[:1]).all())
 
     @property
+    def has_outputs(self) -> bool:
+        """Whether values are outputs of several numbers, which a loss follows."""
+        return self._first is not None and self._first.numel() > 1
+
+    @property
+    def same_outputs(self) -> bool:
+        """Whether there are outputs, and all are equal; False if some are not known any more."""
+        return self.has_outputs and self._same
+
+    @property
     def unbounded(self) -> bool:
         """Whether the last request found a loss so low that there seems to be no minimum, see `is_unbounded`."""
         return bool((self.last[1] < -DEEP).any()) and is_unbounded(self.told[1])
@@ -153,6 +171,7 @@ class Record:
             raise ValueError(f"x0 must be {points.dtype} as there, got {like.dtype}")
         if points.shape[1:] == like.shape and len(points) and not torch.equal(points[0].to(like.device), like):
             raise ValueError(f"x0 must be {short(points[0])} as there, got {short(like)}")
+        self._same = not len(points)
         self._batches, self.complete = [(points.to(like.device), losses.to(like.device))], len(points)
         self._outputs = [state["outputs"].to(like.device)]
         if state["request"] is not None:

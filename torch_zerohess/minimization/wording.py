@@ -6,6 +6,8 @@ from torch_zerohess.minimization.minimum import Status
 
 _NAMED = 5
 """Untouched parameters in a message, at most."""
+REMEDY = "enlarge sigma, or check that x changes fn"
+"""What to do where all outputs are equal."""
 
 
 def worded(
@@ -20,6 +22,7 @@ def worded(
     flat: bool = False,
     measuring: int = 0,
     failed: int = 0,
+    same_outputs: bool = False,
 ) -> str:
     """Return the message of a result.
 
@@ -34,9 +37,12 @@ def worded(
         flat: whether the loss hardly changes along some direction.
         measuring: evaluations with which noise would have been measured; 0 if it was, or was given.
         failed: evaluations whose values are not finite.
+        same_outputs: whether all outputs are known to be equal.
     """
     cut = status in ("budget", "time")
-    if equal and status != "target":
+    if equal and same_outputs:
+        message += f"; all {equal} outputs are equal: {REMEDY}"
+    elif equal and status != "target":
         message += f"; all {equal} values are equal: enlarge sigma"
     elif (status == "stalled" or (cut and (arrived or failed))) and doubt not in message:
         message += f"; {doubt}"

@@ -20,13 +20,12 @@ from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.step import Step
 from torch_zerohess.optim import processes
+from torch_zerohess.optim.outside import check_inside
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], SampleJacobian]
 """What a closure returns: loss, (loss, y), or (loss, y, jacobian), with the inputs y of the black boxes."""
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
-_OUTSIDE = 1e-4
-"""Part of a gradient that may come from elsewhere than the inputs of black boxes, for the dual solve: rounding."""
 _INDEFINITE = 100.0
 """Negative eigenvalue of a curvature that is more than rounding, over the largest magnitude times the rounding."""
 CALLS_BACKWARD = "closure must return the loss without calling backward: the step itself takes the derivatives"
@@ -99,14 +98,8 @@ class Model:
     def dual_step(self, radius: float, damping: float) -> Step | None:
         """Return the step of `linalg.dual.dual_step` for the mean of the losses; None where A is indefinite."""
         A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
-        g = torch.stack([flattened(operator.output_gradient) for operator in self._operators]).double().mean(0)
-        J = self._white_box
-        if float((self.gradient - J.rmatvec(g).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
-            raise ValueError(
-                "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone, "
-                "samples of the Jacobian in the order of the loss, and a network in single or double precision: use "
-                "solver 'steihaug' or 'clip'"
-            )
+        J, sampled = self._white_box, self._jacobian is not None
+        g = check_inside(J, self._operators, self.gradient, sampled=sampled)
         if self._blocks is None:
             values = torch.linalg.eigvalsh(A)
             if float(values[0]) < -_INDEFINITE * torch.finfo(self.loss.dtype).eps * float(values.abs().max()):

@@ -1,5 +1,7 @@
 """The choice of a search by the number of parameters, their bounds, and the evaluations."""
 
+from __future__ import annotations  # signatures print names of types, not what they stand for
+
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, get_args

@@ -86,7 +86,7 @@ XML = """<scene version="3.0.0">
 def test_a_file_of_any_version(tmp_path, name, old) -> None:
     path, text = tmp_path / "scene.xml", XML.format(name=name)
     path.write_text(text.replace("3.0.0", "0.5.0").replace("fov_axis", "fovAxis") if old else text)
-    scene = MitsubaScene(path, [Value("sky.radiance.value")], film=(96, 48), variant="scalar_rgb", threads=1)
+    scene = MitsubaScene(path, [Value("sky.radiance.value")], film=(96, 48), depth=2, variant="scalar_rgb", threads=1)
     (found,) = (key.removesuffix(".x_fov") for key in scene.values.keys() if key.endswith(".x_fov"))  # noqa: SIM118
     assert angle(scene, found) == pytest.approx(x_fov(40.0, "y", (40, 40), (96, 48)), rel=1e-5)
 

@@ -29,6 +29,7 @@ def things(mi):
     surface = vertices, normals, np.array([[0, 1, 2]], np.uint32)
     return {
         "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
         "sensor": camera(mi),
         "ball": {"type": "sphere", "to_world": first},
         "bead": {"type": "sphere", "to_world": second},
@@ -148,7 +149,7 @@ def test_a_mesh_without_normals_moves(variant, tmp_path: Path) -> None:
         mesh = {"type": "obj", "filename": str(tmp_path / "flat.obj"), "face_normals": True}
         return {"type": "scene", "sensor": camera(mi), "triangle": mesh}
 
-    scene = MitsubaScene(flat, [Transform(POSITIONS, move=((1, 2, 3),))], variant=variant, threads=1)
+    scene = MitsubaScene(flat, [Transform(POSITIONS, move=((1, 2, 3),))], depth=2, variant=variant, threads=1)
     scene.set(torch.ones(1).double())
     vertices = np.array(scene.values[POSITIONS], float).reshape(3, 3)
     np.testing.assert_allclose(vertices, [[1, 2, 3], [2, 2, 3], [1, 3, 3]], atol=1e-6)
@@ -265,7 +266,7 @@ def test_names_are_no_patterns(name) -> None:
         return {"type": "scene", "sensor": camera(mi), name: {"type": "sphere"}, "ball": {"type": "sphere"}}
 
     pose = f"{name}.to_world"
-    found = scalar(scene, [Transform(pose, move=((1, 0, 0),))])
+    found = scalar(scene, [Transform(pose, move=((1, 0, 0),))], depth=2)
     assert list(found.values.keys()) == [pose]
     found.set(torch.ones(1).double())
     np.testing.assert_allclose(np.array(found.values[pose].matrix, float).reshape(4, 4)[0, 3], 1.0)
@@ -574,7 +575,7 @@ def test_an_environment_map_is_not_negative() -> None:
         sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}
         return {"type": "scene", "sensor": camera(mi), "mine": sky}
 
-    found = scalar(scene, [Value("mine.data", elements=1)])
+    found = scalar(scene, [Value("mine.data", elements=1)], depth=2)
     assert tuple(side.item() for side in found.bounds) == (0.0, math.inf)
 
 

@@ -88,7 +88,8 @@ def test_samples_without_a_value():
         gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING), v)
     slope, _ = gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING, on_nonfinite="drop"), v)
     assert relative(slope, gradient_and_product(zh.SparseBlackBox(blurred, SMOOTHING), v)[0]) < 0.05
-    slope, _ = gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING, on_nonfinite=1e3), v)
+    with pytest.warns(UserWarning, match=r"explained = 0\.00"):
+        slope, _ = gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING, on_nonfinite=1e3), v)
     assert relative(slope, gradient_and_product(zh.SparseBlackBox(blurred, SMOOTHING), v)[0]) > 0.5
 
 
@@ -299,3 +300,13 @@ def test_autocast_does_not_reach_the_fit():
         return torch.autograd.grad((y - TARGET).square().sum(), x)[0]
 
     assert torch.equal(gradient(autocast=True), gradient(autocast=False))
+
+
+def test_a_dense_black_box_is_a_warning_once_in_a_layer():
+    """Every output depends on each of 200 parameters: no entry is found, and the gradient is zero."""
+    W = normal(50, 200)
+    layer = zh.SparseBlackBox(lambda z: z @ W.T, zh.Smoothing(sigma=0.1, samples=40, seed=0))
+    x = torch.zeros(2, 200, dtype=torch.float64, requires_grad=True)
+    with pytest.warns(UserWarning, match=r"explained = 0\.00 of the changes.* 40, or BlackBox"):
+        layer(x)
+    layer(x)  # a second warning is an error

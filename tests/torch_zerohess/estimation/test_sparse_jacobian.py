@@ -148,8 +148,10 @@ def test_an_earlier_jacobian_is_not_fitted_to_its_own_samples_again():
 def test_a_dense_map_is_noticed_also_by_later_jacobians():
     """80 outputs of all 100 parameters. Three quarters of 40 or 80 samples predict 30 or 60 % of the others."""
     A, x = normal(80, N, seed=1) / 10, torch.zeros(N).double()
-    first = zh.sparse_jacobian(lambda z: z @ A.mT, x, smoothing(40))
-    later = zh.sparse_jacobian(lambda z: z @ A.mT, x, smoothing(80), previous=first)
+    with pytest.warns(UserWarning, match="many parameters"):
+        first = zh.sparse_jacobian(lambda z: z @ A.mT, x, smoothing(40))
+    with pytest.warns(UserWarning, match="many parameters"):
+        later = zh.sparse_jacobian(lambda z: z @ A.mT, x, smoothing(80), previous=first)
     for J, share in ((first, 0.3), (later, 0.6)):
         assert J.explained < 0.1
         assert J.explained_dense == pytest.approx(share, abs=0.1)
@@ -269,3 +271,53 @@ def test_outputs_of_few_numbers(m):
     torch.testing.assert_close(J.dense(), torch.eye(m, 150).double(), atol=1e-3, rtol=0.0)
     assert J.explained > 0.999
     assert torch.equal(J.untouched, torch.arange(150) >= m)
+
+
+DENSE = normal(20, N, seed=5)
+WIDE = torch.exp(-torch.arange(-7, 8).double().square() / 18)
+
+
+def wide(z):
+    """Pixels [16, 16] that are means of 15x15 of 30x30 texels."""
+    kernel = WIDE[:, None] * WIDE / WIDE.sum() ** 2
+    return torch.nn.functional.conv2d(z.view(-1, 1, 30, 30), kernel[None, None])[:, 0]
+
+
+def narrow(z):
+    """Pixels [28, 28] that are means of 3x3 of 30x30 texels."""
+    return torch.nn.functional.avg_pool2d(z.view(-1, 30, 30), 3, 1)
+
+
+@pytest.mark.parametrize(
+    ("fn", "n", "samples", "grid"),
+    [
+        pytest.param(lambda z: z @ DENSE.T, N, 40, None, id="dense, few samples"),
+        pytest.param(lambda z: z @ DENSE.T, N, 150, None, id="dense, more samples than parameters"),
+        pytest.param(wide, 900, 60, (30, 30), id="a wide blur"),
+        pytest.param(narrow, 900, 20, (30, 30), id="too few samples"),
+        pytest.param(lambda z: normal(len(z), 10, 10, seed=int(1e9 * z.abs().max())), N, 40, None, id="only noise"),
+    ],
+)
+def test_a_useless_jacobian_is_a_warning(fn, n, samples, grid):
+    """The first three have errors of 88 to 100 % of their length; the dense one with 150 samples is determined."""
+    with pytest.warns(UserWarning, match=r"explained = 0\.\d\d of the changes") as noted:
+        J = zh.sparse_jacobian(fn, torch.zeros(n).double(), smoothing(samples), grid=grid)
+    assert noted[0].filename == __file__
+    assert J.explained < max(0.05, 0.5 * J.explained_dense)
+
+
+@pytest.mark.parametrize(
+    ("fn", "n", "grid"),
+    [
+        pytest.param(scaled, N, None, id="one parameter each"),
+        pytest.param(narrow, 900, (30, 30), id="a narrow blur"),
+        pytest.param(lambda z: noisy(z) * 0.5, N, None, id="noise"),
+        pytest.param(lambda z: z[:, :4] + 0.1 * normal(len(z), 4, seed=1), 4, None, id="noise, few parameters"),
+        pytest.param(lambda z: z @ DENSE[:, :20].T, 20, None, id="most of 20 entries are found"),
+        pytest.param(lambda z: torch.ones(len(z), 5).double(), N, None, id="constant"),
+        pytest.param(lambda z: 1.0 + 1e-9 * z @ DENSE.T, N, None, id="constant but for rounding"),
+        pytest.param(lambda z: z.square().view(-1, SIDE, SIDE), N, None, id="even"),
+    ],
+)
+def test_no_warning_where_it_is_right_or_nothing_changes(fn, n, grid):
+    zh.sparse_jacobian(fn, torch.zeros(n).double(), smoothing(60), grid=grid)  # a warning is an error

@@ -242,7 +242,36 @@ def test_a_gradient_from_elsewhere_is_refused() -> None:
         y = net(IMAGES)
         return losses(y).square().mean() + flat_norm(net), y
 
-    with pytest.raises(ValueError, match="inputs of black boxes alone"):
+    with pytest.raises(ValueError, match=r"inputs of black boxes alone.* penalty of the weights: use solver"):
+        optimizer.step(closure)
+
+
+@pytest.mark.parametrize("sampled", [False, True], ids=["by rows", "SampleJacobian"])
+def test_a_network_in_half_precision_is_refused_for_its_precision_alone(sampled) -> None:
+    net = network().float()
+    optimizer = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=1e-2, adapt=False)
+
+    def closure():
+        with torch.autocast("cpu", torch.bfloat16):
+            y = net(IMAGES.float()).float()
+        jacobian = (SampleJacobian(net, IMAGES.float()),) if sampled else ()
+        return losses(y).square().mean(), y, *jacobian
+
+    with pytest.raises(ValueError, match=r"^solver 'dual' needs a network in single or double precision, got") as error:
+        optimizer.step(closure)
+    assert "torch.autocast" in str(error.value)
+    assert "black boxes alone" not in str(error.value)
+
+
+def test_samples_in_another_order_are_refused_for_their_order_alone() -> None:
+    net = network()
+    optimizer = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=1e-2, adapt=False)
+
+    def closure() -> tuple[Tensor, Tensor, SampleJacobian]:
+        y = net(IMAGES)
+        return losses(y).square().mean(), y, SampleJacobian(net, IMAGES.flip(0))
+
+    with pytest.raises(ValueError, match=r"^solver 'dual' needs a SampleJacobian of the batch.* another order$"):
         optimizer.step(closure)
 
 

@@ -15,6 +15,8 @@ The same formula with D = s corrects J along the step that was taken (Broyden 19
 element of the output as there are parameters: with a thousand parameters it steps in the span of a few samples only.
 """
 
+from __future__ import annotations  # signatures print names of types, not what they stand for
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

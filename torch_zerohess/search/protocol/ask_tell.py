@@ -9,6 +9,8 @@ To add a search: a subclass of `Progress` with its fields, a subclass of `Method
 `AskTell` that makes the method.
 """
 
+from __future__ import annotations  # signatures print names of types, not what they stand for
+
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence

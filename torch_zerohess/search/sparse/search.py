@@ -4,6 +4,8 @@ Such outputs are local. The other modules of the folder name this search after i
 `method` for how it goes on, and `noisy_method` and `averaging` in noise.
 """
 
+from __future__ import annotations  # signatures print names of types, not what they stand for
+
 from collections.abc import Callable
 from typing import Any
 

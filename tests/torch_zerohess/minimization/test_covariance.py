@@ -1,0 +1,90 @@
+"""Covariances of fitted parameters: against least squares in closed form, and against derivatives by torch."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.minimization.covariance import covariance
+from truths import normal
+
+TIMES, SPREAD = torch.linspace(0, 3, 30).double(), 0.05
+
+
+def line(x):
+    """[K, 2] -> [K, 30]."""
+    return x[:, :1] + x[:, 1:] * TIMES
+
+
+def decay(x):
+    """[K, 2] -> [K, 30]."""
+    return x[:, :1] * torch.exp(-x[:, 1:] * TIMES)
+
+
+def likelihood(model):
+    """Minus its logarithm, but for a constant, of data with independent Gaussian errors around (2, 1)."""
+    data = model(torch.tensor([[2.0, 1.0]]).double())[0] + SPREAD * normal(30)
+    return lambda y: 0.5 * ((y - data) / SPREAD).square().sum()
+
+
+def fitted(model, *, outputs, bounds=None, **settings):
+    loss = likelihood(model)
+    if outputs:
+        return zh.minimize(model, [1.5, 0.7], sigma=0.3, loss=loss, bounds=bounds, seed=0, **settings)
+    fn = torch.func.vmap(lambda x: loss(model(x[None])[0]))
+    return zh.minimize(fn, [1.5, 0.7], sigma=0.3, bounds=bounds, seed=0, **settings)
+
+
+@pytest.mark.parametrize("bounds", [None, (0, 5)], ids=["descent", "gaussian_process"])
+@pytest.mark.parametrize("outputs", [True, False], ids=["image", "loss"])
+def test_of_a_line_it_is_the_covariance_of_least_squares(outputs, bounds) -> None:
+    A = torch.stack([torch.ones(30).double(), TIMES], 1)
+    truth = SPREAD**2 * torch.linalg.inv(A.mT @ A)
+    torch.testing.assert_close(fitted(line, outputs=outputs, bounds=bounds).covariance(), truth, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("bounds", [None, (0, 5)], ids=["descent", "gaussian_process"])
+@pytest.mark.parametrize("outputs", [True, False], ids=["image", "loss"])
+def test_of_a_decay_it_is_the_inverse_of_the_hessian(outputs, bounds) -> None:
+    fit, loss = fitted(decay, outputs=outputs, bounds=bounds), likelihood(decay)
+    truth = torch.linalg.inv(torch.func.hessian(lambda x: loss(decay(x[None])[0]))(fit.x))
+    found = fit.covariance()
+    torch.testing.assert_close(found, truth, rtol=0.06, atol=0)
+    share = fit.standard_errors["hessian_diagonal"] * found.diagonal()
+    error = (found - truth).diagonal().abs() / truth.diagonal()
+    assert bool((error < 3 * share + 5e-3).all())
+
+
+def test_parameters_in_very_different_units() -> None:
+    H = torch.tensor([[1.0, 0.5e-10], [0.5e-10, 1e-20]]).double()
+    truth = torch.tensor([[4 / 3, -2e10 / 3], [-2e10 / 3, 4e20 / 3]]).double()
+    torch.testing.assert_close(covariance(H, torch.zeros(2)), truth)
+
+
+@pytest.mark.parametrize(
+    ("hessian", "errors", "message"),
+    [
+        ([[1.0, 0.0], [0.0, -0.1]], [0.0, 0.0], "eigenvalue -1, mostly along parameter 1"),
+        ([[0.0, 0.0], [0.0, 1.0]], [0.0, 0.0], "eigenvalue 0, mostly along parameter 0"),
+        ([[1.0, 0.0], [0.0, 4.0]], [0.5, 4.0], r"within its errors .* parameter 1, 0\.25, may be wrong by 1 of itself"),
+        ([[1.0, 0.0], [0.0, 4.0]], [float("inf"), 0.0], r"parameter 0, 1, may be wrong by inf of itself"),
+        ([[1.0, float("nan")], [0.0, 4.0]], [0.0, 0.0], "must be finite"),
+    ],
+)
+def test_where_it_is_not_known(hessian, errors, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        covariance(torch.tensor(hessian).double(), torch.tensor(errors).double())
+
+
+def test_a_parameter_that_the_data_do_not_determine_beside_another() -> None:
+    """The data depend on the sum of the parameters, and a millionth as much on their difference."""
+    fit = fitted(lambda x: line(x) + line(x.flip(1)) + 1e-6 * (x[:, :1] - x[:, 1:]), outputs=False)
+    with pytest.raises(ValueError, match="the data do not determine this parameter beside the others"):
+        fit.covariance()
+
+
+def test_a_hessian_that_is_not_known() -> None:
+    fit = replace(fitted(decay, outputs=False), hessian=None)
+    with pytest.raises(ValueError, match="not known, too few evaluations"):
+        fit.covariance()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
+from torch_zerohess.autograd.closed_squares import losses
 from torch_zerohess.estimation.control import NOT_FINITE, Control, Prediction
 from torch_zerohess.estimation.inputs import all_finite
 from torch_zerohess.estimation.smoothness import known_smooth
@@ -122,7 +123,7 @@ def around(
     rest = estimated(center[part], fresh.of(whole_aux)) if len(part) else None
 
     def values(z: Tensor) -> Tensor:
-        inner = outer.inner(predicted(z), scales)
+        inner = outer.inner(losses(predicted, z), scales)
         return control.coefficient * (inner if excess is None else inner + excess)
 
     def expected(x: Tensor) -> tuple[Tensor, Tensor | None]:

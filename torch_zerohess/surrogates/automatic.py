@@ -1,4 +1,4 @@
-"""A surrogate chosen by its predictions of held-out evaluations.
+"""A surrogate chosen by its predictions of evaluations that are left out.
 
 Up to 32 parameters it is a Gaussian process or an affine map. For more parameters it is an affine map: of least norm,
 or with a sparse Jacobian where elements of the output depend on few parameters each. Outputs of many elements are
@@ -18,8 +18,6 @@ from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted
 
 _PROCESS = 32
 """Parameters up to which a Gaussian process is tried; in more, distances say little."""
-_HELD_OUT = 5
-"""One point in so many is held out to compare the two."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
 _RANK = 128
@@ -52,19 +50,7 @@ class AutomaticSurrogate:
             return
         space = LowRank.of(outputs, _rank(points)) if outputs[0].numel() > _WIDE else None
         known = outputs if space is None else space.encode(outputs)
-        models = self._candidates(points)
-        if len(models) > 1:
-            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1), device="cpu")
-            index = index.to(points.device)
-            part = max(1, len(points) // _HELD_OUT)
-            held, rest = index[:part], index[part:]
-            errors = []
-            for model in models:
-                model.fit(points[rest], known[rest])
-                errors.append(float((model(points[held]) - known[held]).double().square().sum()))
-            models = [models[errors.index(min(errors))]]
-        models[0].fit(points, known)
-        self.space, self.model = space, models[0]
+        self.space, self.model = space, self._fitted_to(points, known)
 
     def _takes_sparse(self, points: Tensor, outputs: Tensor) -> bool:
         """Fit a sparse map, and take it if it predicts held-out outputs exactly, or better than least norm does."""
@@ -83,12 +69,18 @@ class AutomaticSurrogate:
         self.space, self.model = None, sparse
         return True
 
-    def _candidates(self, points: Tensor) -> list[Surrogate]:
+    def _fitted_to(self, points: Tensor, known: Tensor) -> Surrogate:
+        """Return the model that predicts outputs better without them, each left out once."""
+        P, n = points.shape
+        if n <= _PROCESS:
+            process = ProcessSurrogate(capacity=self.capacity)
+            process.fit(points, known)
+            affine = left_out_share(points, known) if n + 2 < P else -torch.inf
+            if not affine > process.process.left_out_share:
+                return process
         linear = LinearSurrogate(capacity=self.capacity)
-        if points.shape[1] > _PROCESS:
-            return [linear]
-        process = ProcessSurrogate(capacity=self.capacity)
-        return [process, linear] if len(points) > max(_HELD_OUT, points.shape[1] + 2) else [process]
+        linear.fit(points, known)
+        return linear
 
     def coordinates(self, z: Tensor) -> Tensor:
         """Coordinates [K, r] of the expected outputs at z [K, n], where `space` is not None."""

@@ -1,0 +1,89 @@
+"""Squared errors of a Gaussian process as a function of torch, with its first two derivatives in closed form.
+
+In plain eager mode alone: transforms of `torch.func`, forward mode and third derivatives take the general graph.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.autograd import transforms
+from torch_zerohess.estimation.control import Prediction
+from torch_zerohess.surrogates.squared_distance import SquaredDistance
+
+General = Callable[[Tensor], Tensor]
+"""The same function, with a graph of every order."""
+
+
+def losses(predicted: Prediction, z: Tensor) -> Tensor:
+    """Return `predicted(z)` for points z [B, Q, n], in closed form where it is known."""
+    squares = predicted.squared_distance()
+    if squares is None or _general(z):
+        return predicted(z)
+    if not (z.requires_grad and torch.is_grad_enabled()):
+        return squares.values(z.double()).to(z.dtype)
+    result: Tensor = _Losses.apply(z, squares, predicted)
+    return result
+
+
+class _Losses(torch.autograd.Function):
+    """`apply(z, squares, general)`: the losses [B, Q]."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, squares: SquaredDistance, general: General) -> Tensor:
+        values, gradient, pulled = squares.first(z.double())
+        ctx.save_for_backward(z, gradient, pulled)
+        ctx.squares, ctx.general = squares, general
+        return values.to(z.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, weights: Tensor) -> tuple[Tensor, None, None]:
+        z, gradient, pulled = ctx.saved_tensors
+        again = torch.is_grad_enabled()
+        if _general(weights):
+            with torch.enable_grad():
+                value = ctx.general(z)
+            return torch.autograd.grad(value, z, weights.to(value), create_graph=again)[0], None, None
+        if again:
+            return _Slopes.apply(z, weights, gradient, pulled, ctx.squares, ctx.general), None, None
+        return (weights[..., None] * gradient).to(z.dtype), None, None
+
+
+class _Slopes(torch.autograd.Function):
+    """`apply(z, weights, gradient, pulled, squares, general)`: the derivative of the sum of losses with weights."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        z: Tensor,
+        weights: Tensor,
+        gradient: Tensor,
+        pulled: Tensor,
+        squares: SquaredDistance,
+        general: General,
+    ) -> Tensor:
+        ctx.save_for_backward(z, weights, gradient, pulled)
+        ctx.squares, ctx.general, ctx.hessian = squares, general, None
+        return (weights[..., None] * gradient).to(z.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, v: Tensor) -> tuple[Tensor | None, ...]:
+        z, weights, gradient, pulled = ctx.saved_tensors
+        again = torch.is_grad_enabled()
+        if again or _general(v):
+            with torch.enable_grad():
+                value = ctx.general(z)
+                (slopes,) = torch.autograd.grad(value, z, weights.to(value), create_graph=True)
+            return *torch.autograd.grad(slopes, (z, weights), v, create_graph=again), *[None] * 4
+        if ctx.hessian is None:  # it serves all products
+            ctx.hessian = ctx.squares.hessian(z.double(), pulled)
+        product = (ctx.hessian @ v.double()[..., None])[..., 0]
+        curved = (weights[..., None] * product).to(z.dtype)
+        return curved, (gradient * v).sum(2).to(weights.dtype), *[None] * 4
+
+
+def _general(tensor: Tensor) -> bool:
+    """Whether derivatives are to be taken by transforms, which closed forms do not follow."""
+    return transforms.watched(tensor) or transforms.forward_mode_active() or transforms.mapped_in_graph(tensor)

@@ -25,6 +25,9 @@ _RANK = 128
 _EXACT = 1e-6
 """Share of the change of held-out outputs that a sparse map may leave, where the map of least norm leaves less: the
 sparse one takes far less time, and images have larger rounding."""
+_TRIED, _CLEARLY = 2, 1.25
+"""Points per parameter to which a sparse map of a few elements is fitted first, and how many times the share that least
+norm leaves it leaves where more is not worth the time."""
 _FEW = 3
 """Points per parameter below which each point is left out once to measure the map of least norm."""
 
@@ -55,7 +58,7 @@ class AutomaticSurrogate:
     def _takes_sparse(self, points: Tensor, outputs: Tensor) -> bool:
         """Fit a sparse map, and take it if it predicts held-out outputs exactly, or better than least norm does."""
         P, n = points.shape
-        if n <= _PROCESS or outputs[0].numel() <= _WIDE or P < FEWEST_SAMPLES:
+        if n <= _PROCESS or outputs[0].numel() <= _WIDE or P < FEWEST_SAMPLES or self._clearly_dense(points, outputs):
             return False
         sparse = SparseSurrogate(capacity=self.capacity)
         sparse.fit(points, outputs)
@@ -68,6 +71,17 @@ class AutomaticSurrogate:
             return False
         self.space, self.model = None, sparse
         return True
+
+    def _clearly_dense(self, points: Tensor, outputs: Tensor) -> bool:
+        """Whether a sparse map of a few elements, fitted to the latest points, leaves far more than least norm does."""
+        flat = outputs.flatten(1)
+        some = torch.randperm(flat.shape[1], generator=torch.Generator().manual_seed(2), device="cpu")[:_WIDE]
+        latest = slice(-_TRIED * points.shape[1], None)
+        trial = SparseSurrogate(capacity=self.capacity)
+        trial.fit(points[latest], flat[latest][:, some.to(flat.device)])
+        assert trial.jacobian is not None
+        left, left_dense = 1.0 - trial.jacobian.explained, 1.0 - trial.jacobian.explained_dense
+        return left > max(_CLEARLY * left_dense, _EXACT)
 
     def _fitted_to(self, points: Tensor, known: Tensor) -> Surrogate:
         """Return the model that predicts outputs better without them, each left out once."""

@@ -252,3 +252,8 @@ def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:
     known = type(surrogate) in _WITH_COORDINATES and type(outer.head) is SquaredError
     space: LowRank | None = surrogate.space if known else None
     return space
+
+
+def in_coordinates(surrogate: Any) -> Any:
+    """Return a surrogate of the coordinates of outputs, of which there are few, or of the outputs themselves."""
+    return surrogate.coordinates if type(surrogate) in _WITH_COORDINATES else surrogate

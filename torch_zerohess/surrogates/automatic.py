@@ -1,4 +1,4 @@
-"""A surrogate chosen by its predictions of evaluations that are left out.
+"""A surrogate chosen by its predictions of held-out evaluations.
 
 Up to 32 parameters it is a Gaussian process or an affine map. For more parameters it is an affine map: of least norm,
 or with a sparse Jacobian where elements of the output depend on few parameters each. Outputs of many elements are
@@ -18,6 +18,11 @@ from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted
 
 _PROCESS = 32
 """Parameters up to which a Gaussian process is tried; in more, distances say little."""
+_HELD_OUT, _COMPARED = 5, 1000
+"""One point in so many is held out to compare the two, of so many points at most, drawn at random."""
+_BETTER = 0.99
+"""Squared error of the process, over the error of the affine map, from which on the affine map is taken: it needs no
+draws, and takes far less time."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
 _RANK = 128
@@ -84,15 +89,22 @@ class AutomaticSurrogate:
         return left > max(_CLEARLY * left_dense, _EXACT)
 
     def _fitted_to(self, points: Tensor, known: Tensor) -> Surrogate:
-        """Return the model that predicts outputs better without them, each left out once."""
-        P, n = points.shape
+        """Return the model that predicts held-out outputs better; its fit to the others has the lengths of all."""
+        n, linear = points.shape[1], LinearSurrogate(capacity=self.capacity)
         if n <= _PROCESS:
             process = ProcessSurrogate(capacity=self.capacity)
             process.fit(points, known)
-            affine = left_out_share(points, known) if n + 2 < P else -torch.inf
-            if not affine > process.process.left_out_share:
+            if len(points) <= max(_HELD_OUT, n + 2):
                 return process
-        linear = LinearSurrogate(capacity=self.capacity)
+            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1), device="cpu")[:_COMPARED]
+            index = index.to(points.device)
+            part = max(1, len(index) // _HELD_OUT)
+            held, rest = index[:part], index[part:]
+            models: list[Surrogate] = [process.given(points[rest], known[rest]), linear]
+            linear.fit(points[rest], known[rest])
+            left, left_affine = (float((one(points[held]) - known[held]).double().square().sum()) for one in models)
+            if left < _BETTER * left_affine:
+                return process
         linear.fit(points, known)
         return linear
 

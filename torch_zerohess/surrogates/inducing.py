@@ -42,9 +42,6 @@ class InducedProcess:
     """Cholesky factor of the covariance of the chosen points [M, M]."""
     factor: Tensor
     """Cholesky factor of the regression [M, M]."""
-    left_out_share: float
-    """Share of the change of the outputs that is predicted without them: each is left out once, the chosen points
-    stay."""
 
     @classmethod
     def condition(cls, points: Tensor, outputs: Tensor, kernel: Kernel, noise: float) -> "InducedProcess":
@@ -57,13 +54,10 @@ class InducedProcess:
         square.diagonal().add_(noise)
         factor, projected = torch.linalg.cholesky(square), features.mT @ change
         solved = torch.cholesky_solve(projected, factor)
-        explained, whole = float((projected * solved).sum()), float(change.square().sum())
-        variance = max(whole - explained, 0.0) / (noise * change.numel()) or 1.0
+        explained = float((projected * solved).sum())
+        variance = max(float(change.square().sum()) - explained, 0.0) / (noise * change.numel()) or 1.0
         weights = torch.linalg.solve_triangular(lower.mT, solved, upper=True)
-        own = 1.0 - torch.linalg.solve_triangular(factor, features.mT, upper=False).square().sum(0)
-        wrong = float(((change - features @ solved).square().sum(1) / own.square()).sum())
-        share = 1.0 - wrong / (whole or 1.0)
-        return cls(points[chosen], kernel, mean, weights, variance, noise, lower, factor, share)
+        return cls(points[chosen], kernel, mean, weights, variance, noise, lower, factor)
 
     def __call__(self, x: Tensor) -> Tensor:
         """Expected outputs [Q, m] at points x [Q, n], with derivatives of every order in x."""

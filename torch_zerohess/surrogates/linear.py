@@ -79,11 +79,11 @@ def left_out_share(points: Tensor, outputs: Tensor) -> float:
     middle, y = z.mean(0), scaled(y - y.mean(0))[0]
     z = (z - middle) / _units(z - middle, middle)
     half = torch.linalg.solve_triangular(torch.linalg.cholesky(raised(z.mT @ z, _RIDGE)), z.mT, upper=False)
-    own = 1.0 - half.square().sum(0) - 1.0 / len(z)
+    fitting = half.mT @ half
+    own = 1.0 - fitting.diagonal() - 1.0 / len(z)
     if not float(own.min()) > _ALONE:
         return -torch.inf
-    half = half.to(y)
-    wrong = (y - half.mT @ (half @ y)) / own.to(y)[:, None]
+    wrong = (y - fitting.to(y) @ y) / own.to(y)[:, None]
     return 1.0 - float(wrong.square().sum(dtype=torch.float64)) / (float(y.square().sum(dtype=torch.float64)) or 1.0)
 
 

@@ -74,9 +74,12 @@ class _Slopes(torch.autograd.Function):
         again = torch.is_grad_enabled()
         if again or _general(v):
             with torch.enable_grad():
-                value = ctx.general(z)
-                (slopes,) = torch.autograd.grad(value, z, weights.to(value), create_graph=True)
-            return *torch.autograd.grad(slopes, (z, weights), v, create_graph=again), *[None] * 4
+                ends = z.view_as(z), weights.view_as(weights)  # weights may depend on z
+                value = ctx.general(ends[0])
+                (slopes,) = torch.autograd.grad(value, ends[0], ends[1].to(value), create_graph=True)
+            wanted = [one for one in ends if one.requires_grad]
+            found = iter(torch.autograd.grad(slopes, wanted, v, create_graph=again))
+            return *(next(found) if one.requires_grad else None for one in ends), *[None] * 4
         if ctx.hessian is None:  # it serves all products
             ctx.hessian = ctx.squares.hessian(z.double(), pulled)
         product = (ctx.hessian @ v.double()[..., None])[..., 0]

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import torch_zerohess as zh
 from torch_zerohess.estimation.control import Prediction
@@ -73,8 +74,8 @@ def derivatives(layer, references):
     every = grad(slope, x, units, is_grads_batched=True)
     mapped = torch.func.vmap(lambda t: grad(slope, x, t))(units)
     weights = torch.eye(len(X), dtype=X.dtype)
-    rows = grad(value, x, weights, is_grads_batched=True)
-    return [value.detach(), first, second, third, every, mapped, rows]
+    rows = grad(value, x, weights, is_grads_batched=True, create_graph=True)
+    return [value.detach(), first, second, third, every, mapped, rows.detach(), grad(rows, x, rows.detach())]
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -119,6 +120,20 @@ def test_transforms_and_forward_mode_are_those_of_the_general_graph(general):
     for one, other in zip(found, all_of_them(), strict=True):
         torch.testing.assert_close(one, other)
     assert closed.isfinite().all()
+
+
+def test_forward_mode_without_a_transform_is_that_of_the_general_graph(general):
+    layer, references = layer_of("coordinates")
+
+    def tangent():
+        with forward_ad.dual_level():
+            value = layer(forward_ad.make_dual(X, torch.ones_like(X)), references)
+            return forward_ad.unpack_dual(value).tangent
+
+    found = tangent()
+    assert found.any()
+    general()
+    torch.testing.assert_close(found, tangent())
 
 
 def test_one_hessian_serves_all_products(monkeypatch):

@@ -77,7 +77,7 @@ def test_a_sparse_map_is_tried_on_a_few_elements_of_dense_outputs(monkeypatch):
 
     monkeypatch.setattr(automatic.SparseSurrogate, "fit", recorded)
     z, surrogate = normal(400, 50), AutomaticSurrogate()
-    surrogate.fit(z, z @ normal(50, 300, seed=1))
+    surrogate.fit(z, z @ normal(50, 300, seed=1) + normal(400, 300, seed=2))
     assert sizes == [(100, 50, 64)]
     assert isinstance(surrogate.model, LinearSurrogate)
     surrogate.fit(z, z[:, :3].repeat(1, 100))

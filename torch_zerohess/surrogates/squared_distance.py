@@ -66,6 +66,11 @@ class SquaredDistance:
         (squares,) = self._in_parts(lambda z, y: (_squares(self._errors(self._around(z), y)),), z, self._targets(z))
         return squares + self.b[:, None]
 
+    def general(self, z: Tensor) -> Tensor:
+        """Return l [B, Q] in the type of z, with a graph of every order: a later fit does not change it."""
+        e = self.process((z.double() / self.lengths).flatten(0, 1)).unflatten(0, z.shape[:2]) - self.y[:, None]
+        return (e.square().sum(2) + self.b[:, None]).to(z.dtype)
+
     def first(self, z: Tensor) -> First:
         """Return l, its gradient and what `hessian` needs."""
         squares, *others = self._in_parts(self._first, z, self._targets(z))

@@ -137,6 +137,16 @@ def test_forward_mode_without_a_transform_is_that_of_the_general_graph(general):
     torch.testing.assert_close(found, tangent())
 
 
+def test_a_later_fit_changes_no_derivative():
+    layer, references = layer_of("coordinates")
+    x, v = X.clone().requires_grad_(), normal(*X.shape, seed=7)
+    slope = grad(layer(x, references).sum(), x, create_graph=True)
+    before = grad(grad(slope, x, v, create_graph=True), x, v)
+    layer.memory.add(normal(30, 2, seed=8), 5.0 * image(normal(30, 2, seed=9)))
+    layer.memory.fit()
+    torch.testing.assert_close(grad(grad(slope, x, v, create_graph=True), x, v), before)
+
+
 def test_one_hessian_serves_all_products(monkeypatch):
     layer, references = layer_of("coordinates")
     honest, calls = SquaredDistance.hessian, []

@@ -14,12 +14,10 @@ from torch_zerohess.surrogates.squared_distance import SquaredDistance
 
 
 def losses(predicted: Prediction, z: Tensor) -> Tensor:
-    """Return `predicted(z)` for points z [B, Q, n], in closed form where it is known."""
-    squares = predicted.squared_distance()
+    """Return `predicted(z)` for points z [B, Q, n], with derivatives in closed form where they are known."""
+    squares = predicted.squared_distance() if z.requires_grad and torch.is_grad_enabled() else None
     if squares is None or _general(z):
         return predicted(z)
-    if not (z.requires_grad and torch.is_grad_enabled()):
-        return squares.values(z.double()).to(z.dtype)
     result: Tensor = _Losses.apply(z, squares)
     return result
 

@@ -61,11 +61,6 @@ class SquaredDistance:
     b: Tensor
     """[B]"""
 
-    def values(self, z: Tensor) -> Tensor:
-        """Return l [B, Q]."""
-        (squares,) = self._in_parts(lambda z, y: (_squares(self._errors(self._around(z), y)),), z, self._targets(z))
-        return squares + self.b[:, None]
-
     def general(self, z: Tensor) -> Tensor:
         """Return l [B, Q] in the type of z, with a graph of every order: a later fit does not change it."""
         e = self.process((z.double() / self.lengths).flatten(0, 1)).unflatten(0, z.shape[:2]) - self.y[:, None]
@@ -105,7 +100,7 @@ class SquaredDistance:
         e = self._errors(at, y)
         q = e @ self.process.weights.mT
         gradient = _weighted_sum(q * at.slopes, at)
-        return _squares(e), 2.0 * gradient / self.lengths, q
+        return e.square().sum(1), 2.0 * gradient / self.lengths, q
 
     def _hessian(self, z: Tensor, q: Tensor) -> tuple[Tensor]:
         at = self._around(z)
@@ -119,10 +114,6 @@ class SquaredDistance:
         half = torch.baddbmm(torch.stack(rows, 1), jacobian, jacobian.mT)
         half.diagonal(dim1=1, dim2=2).add_((q * at.slopes).sum(1, keepdim=True))
         return (2.0 * half / (self.lengths[:, None] * self.lengths),)
-
-
-def _squares(e: Tensor) -> Tensor:
-    return e.square().sum(1)
 
 
 def _weighted_sum(weights: Tensor, at: _Around) -> Tensor:

@@ -28,7 +28,7 @@ def test_values_and_two_derivatives_are_those_of_the_process(kernel, n):
     values = torch.func.vmap(one)(*pairs).view(B, Q) + vector(0.0, 1.0, 2.0)[:, None]
     found = squares.first(z)
     torch.testing.assert_close(found.values, values, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(squares.values(z), values, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(squares.general(z), values, rtol=1e-9, atol=1e-9)
     gradient = torch.func.vmap(torch.func.grad(one))(*pairs).view(B, Q, n)
     torch.testing.assert_close(found.gradient, gradient, rtol=1e-8, atol=1e-8)
     hessian = torch.func.vmap(torch.func.hessian(one))(*pairs).view(B, Q, n, n)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
+from torch_zerohess.autograd.closed_squares import losses
 from torch_zerohess.estimation.control import NOT_FINITE, Control, Prediction
 from torch_zerohess.estimation.inputs import all_finite
 from torch_zerohess.estimation.smoothness import known_smooth
@@ -175,5 +176,5 @@ class _Terms:
         return result, new
 
     def _values(self, z: Tensor) -> Tensor:
-        control, inner = self.call.control, self.call.control.outer.inner(self.predicted(z), self.scales)
+        control, inner = self.call.control, self.call.control.outer.inner(losses(self.predicted, z), self.scales)
         return control.coefficient * (inner if self.excess is None else inner + self.excess)

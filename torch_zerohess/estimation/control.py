@@ -5,7 +5,7 @@ The surrogate and the coefficient come from earlier calls. They do not change du
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -20,10 +20,12 @@ from torch_zerohess.evaluation_mode import evaluation_mode
 from torch_zerohess.heads import SquaredError
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
 from torch_zerohess.surrogates.memory import Memory
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
+from torch_zerohess.surrogates.squared_distance import SquaredDistance
 
 _WITH_COORDINATES = (AutomaticSurrogate, LowRankSurrogate)
 """Exact types: a subclass may predict anything, and a surrogate of the caller's may have a `space` of its own."""
@@ -182,13 +184,32 @@ class Prediction:
             )
         return outputs
 
+    def squared_distance(self) -> SquaredDistance | None:
+        """Return the losses in closed form, if they are squared errors of a Gaussian process."""
+        model = self._model
+        if type(self._head) is not SquaredError or type(model) is not ProcessSurrogate:
+            return None
+        if self.encoded:
+            known, outside = self.encoded
+            return SquaredDistance(model.process, model.lengths, known.double(), outside.double())
+        (references,) = self._aux
+        SquaredError.check(self._shape or (), references)
+        flat = references.reshape(len(references), -1).double()
+        root = flat.shape[1] ** -0.5  # the mean over the elements of an output
+        process = replace(model.process, mean=root * model.process.mean, weights=root * model.process.weights)
+        return SquaredDistance(process, model.lengths, root * flat, flat.new_zeros(len(flat)))
+
+    @property
+    def _model(self) -> Any:
+        """The surrogate of coordinates or outputs: one of the caller's with a model in it may be anything."""
+        return self._surrogate.model if type(self._surrogate) in _WITH_COORDINATES else self._surrogate
+
     def excess(self, sigma: Tensor) -> Tensor | None:
         """Return E h(g(z + sigma u), r) - h(g(z), r) where it is the same for all z and r, else None.
 
         It is for affine g and squared errors: the variance of an element of g(z + sigma u), as a mean over elements.
         """
-        # A surrogate of the caller's with a model in it may be anything.
-        model = self._surrogate.model if type(self._surrogate) in _WITH_COORDINATES else self._surrogate
+        model = self._model
         if type(self._head) is not SquaredError or type(model) not in (LinearSurrogate, SparseSurrogate):
             return None
         whole = model.variance(sigma)
@@ -231,3 +252,8 @@ def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:
     known = type(surrogate) in _WITH_COORDINATES and type(outer.head) is SquaredError
     space: LowRank | None = surrogate.space if known else None
     return space
+
+
+def in_coordinates(surrogate: Any) -> Any:
+    """Return a surrogate of the coordinates of outputs, of which there are few, or of the outputs themselves."""
+    return surrogate.coordinates if type(surrogate) in _WITH_COORDINATES else surrogate

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.control import Control, Prediction
+from torch_zerohess.estimation.control import Control, Prediction, in_coordinates
 from torch_zerohess.estimation.smoothness import check_repeats, jumps, known_smooth, smooth_orders
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.surrogate_mean import nodes, per_element
@@ -273,7 +273,7 @@ def _smooth_orders(
     step = -(-count // _LOOKED)
     looked = (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype)
     check_repeats(memory.surrogate, looked)
-    found = jumps(memory.surrogate, looked)
+    found = jumps(in_coordinates(memory.surrogate), looked)
     if found is not False:
         return None if found is None else 0
     return 2 if known_smooth(control) else smooth_orders(control, x, aux, sigma, seed)

@@ -18,8 +18,11 @@ from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted
 
 _PROCESS = 32
 """Parameters up to which a Gaussian process is tried; in more, distances say little."""
-_HELD_OUT = 5
-"""One point in so many is held out to compare the two."""
+_HELD_OUT, _COMPARED = 5, 1000
+"""One point in so many is held out to compare the two, of so many points at most, drawn at random."""
+_BETTER = 0.99
+"""Squared error of the process, over the error of the affine map, from which on the affine map is taken: it needs no
+draws, and takes far less time."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
 _RANK = 128
@@ -27,6 +30,9 @@ _RANK = 128
 _EXACT = 1e-6
 """Share of the change of held-out outputs that a sparse map may leave, where the map of least norm leaves less: the
 sparse one takes far less time, and images have larger rounding."""
+_TRIED, _CLEARLY = 2, 1.25
+"""Points per parameter to which a sparse map of a few elements is fitted first, and how many times the share that least
+norm leaves it leaves where more is not worth the time."""
 _FEW = 3
 """Points per parameter below which each point is left out once to measure the map of least norm."""
 
@@ -52,24 +58,12 @@ class AutomaticSurrogate:
             return
         space = LowRank.of(outputs, _rank(points)) if outputs[0].numel() > _WIDE else None
         known = outputs if space is None else space.encode(outputs)
-        models = self._candidates(points)
-        if len(models) > 1:
-            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1), device="cpu")
-            index = index.to(points.device)
-            part = max(1, len(points) // _HELD_OUT)
-            held, rest = index[:part], index[part:]
-            errors = []
-            for model in models:
-                model.fit(points[rest], known[rest])
-                errors.append(float((model(points[held]) - known[held]).double().square().sum()))
-            models = [models[errors.index(min(errors))]]
-        models[0].fit(points, known)
-        self.space, self.model = space, models[0]
+        self.space, self.model = space, self._fitted_to(points, known)
 
     def _takes_sparse(self, points: Tensor, outputs: Tensor) -> bool:
         """Fit a sparse map, and take it if it predicts held-out outputs exactly, or better than least norm does."""
         P, n = points.shape
-        if n <= _PROCESS or outputs[0].numel() <= _WIDE or P < FEWEST_SAMPLES:
+        if n <= _PROCESS or outputs[0].numel() <= _WIDE or P < FEWEST_SAMPLES or self._clearly_dense(points, outputs):
             return False
         sparse = SparseSurrogate(capacity=self.capacity)
         sparse.fit(points, outputs)
@@ -83,12 +77,36 @@ class AutomaticSurrogate:
         self.space, self.model = None, sparse
         return True
 
-    def _candidates(self, points: Tensor) -> list[Surrogate]:
-        linear = LinearSurrogate(capacity=self.capacity)
-        if points.shape[1] > _PROCESS:
-            return [linear]
-        process = ProcessSurrogate(capacity=self.capacity)
-        return [process, linear] if len(points) > max(_HELD_OUT, points.shape[1] + 2) else [process]
+    def _clearly_dense(self, points: Tensor, outputs: Tensor) -> bool:
+        """Whether a sparse map of a few elements, fitted to the latest points, leaves far more than least norm does."""
+        flat = outputs.flatten(1)
+        some = torch.randperm(flat.shape[1], generator=torch.Generator().manual_seed(2), device="cpu")[:_WIDE]
+        latest = slice(-_TRIED * points.shape[1], None)
+        trial = SparseSurrogate(capacity=self.capacity)
+        trial.fit(points[latest], flat[latest][:, some.to(flat.device)])
+        assert trial.jacobian is not None
+        left, left_dense = 1.0 - trial.jacobian.explained, 1.0 - trial.jacobian.explained_dense
+        return left > max(_CLEARLY * left_dense, _EXACT)
+
+    def _fitted_to(self, points: Tensor, known: Tensor) -> Surrogate:
+        """Return the model that predicts held-out outputs better; its fit to the others has the lengths of all."""
+        n, linear = points.shape[1], LinearSurrogate(capacity=self.capacity)
+        if n <= _PROCESS:
+            process = ProcessSurrogate(capacity=self.capacity)
+            process.fit(points, known)
+            if len(points) <= max(_HELD_OUT, n + 2):
+                return process
+            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1), device="cpu")[:_COMPARED]
+            index = index.to(points.device)
+            part = max(1, len(index) // _HELD_OUT)
+            held, rest = index[:part], index[part:]
+            models: list[Surrogate] = [process.given(points[rest], known[rest]), linear]
+            linear.fit(points[rest], known[rest])
+            left, left_affine = (float((one(points[held]) - known[held]).double().square().sum()) for one in models)
+            if left < _BETTER * left_affine:
+                return process
+        linear.fit(points, known)
+        return linear
 
     def coordinates(self, z: Tensor) -> Tensor:
         """Coordinates [K, r] of the expected outputs at z [K, n], where `space` is not None."""

@@ -1,5 +1,7 @@
 """Gaussian process as a surrogate: thousands of points in any units, one length per parameter, all by the evidence."""
 
+import copy
+
 import torch
 from torch import Tensor
 
@@ -60,6 +62,13 @@ class ProcessSurrogate:
         choice = most_likely(u[some], y[some] - y[some].mean(0), anisotropic=u.shape[1] <= _MOST)
         self._lengths = spread * choice.lengths
         self._process = InducedProcess.condition(u / choice.lengths, y, choice.kernel, choice.noise)
+
+    def given(self, points: Tensor, outputs: Tensor) -> "ProcessSurrogate":
+        """Return a process with kernel, lengths and noise of this one, given other outputs [P, *out]."""
+        known, other = self.process, copy.copy(self)
+        y = outputs.reshape(len(outputs), -1).double()
+        other._process = InducedProcess.condition(points.double() / self._lengths, y, known.kernel, known.noise)
+        return other
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""

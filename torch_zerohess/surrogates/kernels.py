@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-_ZERO = 1e-16
+ZERO = 1e-16
 """Added to squared distances: their root has no derivative at zero, and next to it the kernels' derivatives are lost in
 rounding."""
 
@@ -38,6 +38,21 @@ def gaussian(distance: Tensor) -> Tensor:
 
 
 KERNELS: tuple[Kernel, ...] = (matern, gaussian)
+
+
+def with_slopes(kernel: Kernel, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a kernel k(d), one of `KERNELS`, and k'(d) / d: its gradient over the difference of the two points."""
+    if kernel is gaussian:
+        covariance = kernel(distance)
+        return covariance, -covariance
+    scaled = math.sqrt(3.0) * distance
+    decay = torch.exp(-scaled)
+    return (1.0 + scaled) * decay, -3.0 * decay
+
+
+def bends(kernel: Kernel, distance: Tensor, slopes: Tensor) -> Tensor:
+    """Return the derivative in d of the slopes k'(d) / d of `with_slopes`, over d."""
+    return -slopes if kernel is gaussian else -math.sqrt(3.0) * slopes / distance
 
 
 _ADDITIVE = 4
@@ -74,4 +89,4 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
     squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
     # Rounding can make a square negative. The correction is a constant for autograd.
     rounding = squares.detach().clamp(max=0.0)
-    return (squares - rounding + _ZERO).sqrt()
+    return (squares - rounding + ZERO).sqrt()

@@ -16,7 +16,7 @@ from torch_zerohess.surrogates.gaussian_process import (
     grid_evidence,
 )
 from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
-from torch_zerohess.surrogates.kernels import KERNELS, gaussian, matern
+from torch_zerohess.surrogates.kernels import KERNELS, distances, gaussian, matern
 from torch_zerohess.surrogates.lengths import log_evidence, most_likely
 from truths import normal, vector
 
@@ -121,6 +121,42 @@ def test_the_evidence_of_one_length_per_parameter():
         expected = 2 / 5 * log_likelihood(points, change, kernel, each, 0.01)
         expected += 9 * (math.log(2 * math.pi) + 1) - float((each.log() / 1.5).square().mean())
         assert float(found) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("lengths_of_all", [False, True])
+def test_slopes_of_the_evidence_are_those_of_the_likelihood(kernel, lengths_of_all):
+    points = normal(9, 3)
+    change = waves(points) - waves(points).mean(0)
+
+    def formula(logs):
+        each, noise = logs[:-1].exp().expand(3), logs[-1].exp()
+        K = kernel(distances(points / each, points / each)) + 1.0 + noise * torch.eye(9).double()
+        variance = (change * torch.linalg.solve(K, change)).mean()
+        return -9 * variance.log() - torch.logdet(K) - (each.log() / 1.5).square().mean()
+
+    def evidence(logs):
+        return log_evidence(points, change, kernel, logs[:-1].exp().expand(3), logs[-1].exp())
+
+    logs = vector(*([0.3] if lengths_of_all else [-0.7, 0.1, 1.0]), -3.0)
+    torch.testing.assert_close(torch.func.grad(evidence)(logs), torch.func.grad(formula)(logs), rtol=1e-8, atol=1e-8)
+
+
+def test_a_climb_from_some_of_the_points_ends_where_a_climb_from_all_does(monkeypatch):
+    """Of 200 points 100 choose the starts."""
+    calls, honest = [], lengths.grid_evidence
+    points = 4 * torch.rand(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    change = drawn(points, gaussian, vector(0.4, 0.4), 1e-2, 3)
+
+    def table(points, *more):
+        calls.append(len(points))
+        return honest(points, *more)
+
+    monkeypatch.setattr(lengths, "grid_evidence", table)
+    found = most_likely(points, change, anisotropic=True)
+    monkeypatch.setattr(lengths, "_STARTS", 200)
+    assert most_likely(points, change, anisotropic=True).evidence < found.evidence + 0.1
+    assert calls == [100, 200]
 
 
 def test_the_entries_with_the_highest_evidence_are_chosen():

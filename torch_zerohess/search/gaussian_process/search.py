@@ -30,7 +30,8 @@ class GaussianProcessSearch(AskTell[Any]):
 
     In noise `x` is the point whose predicted output has the lowest loss, or with the loss alone the lowest predicted
     loss, and `value` is that prediction. Noise in outputs is detected after some 10 (n + 1) of them; noise in a plain
-    loss is declared with `noise`.
+    loss is declared with `noise`. Such a loss is predicted on a log scale above some 30 or 300 deviations of the noise,
+    or as it is, whichever is likelier: in a wide box it may span many decades. One step in four takes it as it is.
 
     It has the settings of `AskTell`; `bounds` are required and finite. By default the pool keeps 60 evaluations. The
     time of a step grows with the third power of their number.
@@ -43,7 +44,8 @@ class GaussianProcessSearch(AskTell[Any]):
     type.
 
     Source: Rasmussen and Williams (2006) for the process; Astudillo and Frazier (2019) for the composite function;
-    Duvenaud, Nickisch and Rasmussen (2011) for additive kernels.
+    Duvenaud, Nickisch and Rasmussen (2011) for additive kernels; Snelson, Rasmussen and Ghahramani (2004) for the
+    scale.
 
     Example:
         >>> import torch

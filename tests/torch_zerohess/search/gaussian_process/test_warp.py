@@ -1,0 +1,68 @@
+"""The warp of noisy losses: the scale that the losses were made with is found, and a search over decades arrives."""
+
+import math
+
+import pytest
+import torch
+
+from torch_zerohess.optim import GaussianProcessSearch
+from torch_zerohess.search.gaussian_process.warp import warped
+from truths import vector
+
+
+@pytest.mark.parametrize("unit", [math.inf, 300.0, 30.0])
+def test_the_evidence_finds_the_scale_on_which_losses_are_smooth(unit):
+    """Losses v for which u asinh(v / u) is a sum of waves: eight of ten times they are warped by this u."""
+    found = 0
+    for seed in range(10):
+        generator = torch.Generator().manual_seed(seed)
+        points = 4.0 * torch.rand(60, 2, generator=generator, dtype=torch.float64) - 2.0
+        waves = torch.sin(1.5 * points).sum(1) + torch.cos(points[:, 0] - points[:, 1])
+        smooth = 600.0 * (waves - waves.min())
+        losses = smooth if unit == math.inf else unit * (smooth / unit).sinh()
+        losses = losses + torch.randn(60, generator=generator, dtype=torch.float64)  # noise of standard deviation 1
+        losses = losses - losses.min()
+        size = float(losses.max())
+        scaled = size * warped(points, losses / size, 1.0 / size, ("joint",))
+        found += torch.allclose(scaled, losses if unit == math.inf else unit * (losses / unit).asinh())
+    assert found >= 8
+
+
+@pytest.mark.parametrize("deviation", [1e-200, 5e-324])
+def test_losses_that_overflow_over_the_noise_are_not_warped(deviation):
+    points = torch.linspace(-1.0, 1.0, 8, dtype=torch.float64)[:, None]
+    losses = (points[:, 0] - points[0, 0]).exp() / 10
+    losses = losses - losses.min()
+    assert torch.equal(warped(points, losses, deviation, ("joint",)), losses)
+
+
+def searched(loss, x0, sigma, bounds, noise, seed, evaluations):
+    """The loss at the best point of a search in noise."""
+    generator = torch.Generator().manual_seed(seed)
+    search = GaussianProcessSearch(x0, sigma=sigma, bounds=bounds, noise=noise, seed=seed, restarts=100)
+    while search.evaluations < evaluations:
+        points = search.ask()
+        search.tell(loss(points) + noise * torch.randn(len(points), generator=generator, dtype=torch.float64))
+    return float(loss(search.x[None]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_noisy_loss_over_many_decades_is_followed_to_its_minimum(seed):
+    """The fit of a decay: the loss is 72 at the start, up to 6e7 in the box, and below the noise at the end."""
+    t = torch.linspace(0.0, 4.0, 12, dtype=torch.float64)
+
+    def loss(x):
+        return 50.0 * (x[:, :1] * torch.exp(-x[:, 1:] * t) - 3.0 * torch.exp(-t)).square().sum(1)
+
+    assert searched(loss, vector(4.0, 1.6), 0.3, (-1.0, 15.0), 0.05, seed, 80) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_warped_loss_hides_no_other_basin(seed):
+    """The search begins in a basin that ends at 8; the other one ends at 0, between losses that are higher by far."""
+
+    def loss(x):
+        near, far = x + vector(1.0, 1.5), x - vector(1.5, 1.0)
+        return torch.minimum(8.0 + 20.0 * near.square().sum(1), 50.0 * far.square().sum(1))
+
+    assert searched(loss, vector(-0.8, -1.0), 0.5, (-4.0, 4.0), 0.5, seed, 160) < 1.0

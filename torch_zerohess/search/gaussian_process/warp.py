@@ -1,0 +1,45 @@
+"""A warp of noisy losses that span many decades: a stationary process follows them only on a log scale.
+
+The warp of losses v >= 0 above the lowest one is y = u asinh(v / u): equal to v up to about u, and a logarithm beyond.
+The slope is 1 where losses are low, so noise keeps its standard deviation there. Noise of high losses becomes smaller
+than the process takes it to be. The evidence of the process chooses u, as it chooses the kernel: the likelihood of y
+times the slopes dy/dv is a likelihood of v (Snelson, Rasmussen and Ghahramani 2004).
+
+A process of logarithms expects nothing lower in other basins, whose flanks are all it knows of them. So one step in
+`LOOK` is by a process of the losses as they are. It moves no best point: it does not resolve low losses.
+"""
+
+import math
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, grid_evidence
+from torch_zerohess.surrogates.kernels import Structure
+
+LOOK = 4
+"""Steps of which one looks for other basins."""
+_UNITS = (300.0, 30.0)
+"""Units u of a warp, over the noise, to choose from. No warp is the third choice."""
+
+
+def warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
+    """Return losses [P] on the scale on which a process has the highest evidence: warped, or as they are.
+
+    Args:
+        points: [P, n].
+        losses: [P], the lowest one 0, the highest one at most 1.
+        deviation: standard deviation of repeated losses at one point.
+        structures: of the kernel of the process.
+    """
+    likely, highest = losses, -math.inf
+    for unit in (math.inf, *(one * deviation for one in _UNITS)):
+        scaled = losses / unit
+        values = losses if unit == math.inf else unit * scaled.asinh()
+        change = (values - values.mean())[:, None]
+        evidence, _ = grid_evidence(points, change, NOISES + HIGH_NOISES, deviation, structures)
+        # Twice the log likelihood. It is not finite where `scaled` overflows, and then the unit is not chosen.
+        total = float(evidence.max()) - float(scaled.square().log1p().sum())
+        if total > highest:
+            likely, highest = values, total
+    return likely

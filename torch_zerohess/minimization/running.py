@@ -64,7 +64,7 @@ class Running:
         self._limits, self._then = dict(limits), noted
         self._file, self._verbose = None if path is None else Checkpoint(path), verbose
         self._sure = noise is not None
-        """Whether it is known, if there is no noise."""
+        """Whether the noise needs no second look: the caller gave it, or x was evaluated again."""
         self._unmeasured = False
         """Whether the evaluations were too few to measure noise."""
         self._begun = self._written = self._said = time.monotonic()

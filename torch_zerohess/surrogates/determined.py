@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, quadratic_terms
 
 _EXTENT = 1e-2
 """Least singular value of the weighted terms, in units of sigma: smaller ones are dominated by the
@@ -22,7 +22,7 @@ def with_true_errors(model: LocalModel, u: Tensor, weights: Tensor) -> LocalMode
     P, n = u.shape
     if model.basis is not None:  # they are infinite
         return model
-    squares = model.jacobian is None and coefficients(n) <= P
+    squares = model.jacobian is None and coefficient_count(n) <= P
     unknown = _unknown(quadratic_terms(u) if squares else _linear_terms(u), weights)
     slopes = bends = unknown[1 : n + 1]
     if squares:

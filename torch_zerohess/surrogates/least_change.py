@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.quadratic import coefficients
+from torch_zerohess.surrogates.quadratic import coefficient_count
 
 _EXACT = 1e-10
 """Variance of a value that is no quadratic, in units of the mean variance of the quadratics at the points."""
@@ -60,7 +60,7 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
     rest = values - 0.5 * bend
     scale = (_SCALED * n) ** 0.5 / (float(hessian.norm()) or 1.0) if n > _TOLD else 0.0
     bend = scale * bend
-    if len(u) < _FEW * coefficients(n):
+    if len(u) < _FEW * coefficient_count(n):
         fit = _Affine.through(u, values, rest, bend, _OF_FEW)
     else:
         smooth, rough = (_Affine.through(u, values, rest, bend, rate) for rate in (_CUBIC, _ROUGH))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torch_zerohess.surrogates.gaussian_process import CONSTANT, DEVIATION_DEGREES
 from torch_zerohess.surrogates.inducing import decomposed
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, factored, quadratic_terms, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, factored, quadratic_terms, symmetric
 
 LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Lengths of the process, in units of the width."""
@@ -144,7 +144,7 @@ def most_certain(steps: Tensor, fitted: Callable[[Tensor, Tensor], tuple[LocalMo
         fitted: numbers of evaluations and their width [n] to a quadratic and what is returned; None if they do not
             determine a quadratic.
     """
-    unit, least = mean_length(steps), coefficients(steps.shape[1]) + _SPARE
+    unit, least = mean_length(steps), coefficient_count(steps.shape[1]) + _SPARE
     order = (steps / unit).norm(dim=1).argsort(stable=True)
     found, count, most = [], len(order), max(_MOST, 2 * least)
     while count >= least:
@@ -181,7 +181,7 @@ def _model(u: Tensor, values: Tensor, noise: float, others: Tensor) -> tuple[Loc
     mean = weights @ choices.means
     error = (weights @ (choices.variances + (choices.means - mean).square())).sqrt()
     mean, error = largest * (size * mean), largest * (size * error)
-    q = coefficients(n)
+    q = coefficient_count(n)
     slope, bend = error[1 : n + 1], symmetric(error[n + 1 : q], n).diagonal()
     value = largest * float(base) + float(mean[0])
     model = LocalModel(value, mean[1 : n + 1], symmetric(mean[n + 1 : q], n), None, slope, bend)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torch_zerohess.surrogates import noisy_derivatives as of_losses
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, symmetric
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class OutputRegression:
 
     def _quadratic(self, known: _Outputs, n: int) -> LocalModel:
         """Return the quadratic of the loss at 0."""
-        q = coefficients(n)
+        q = coefficient_count(n)
         output, jacobian, bends = known.terms[0], known.terms[1 : n + 1], known.terms[n + 1 : q]
         expanded = loss_curvature(self.loss, output.view(self.shape))
         slope = expanded.slope.flatten()

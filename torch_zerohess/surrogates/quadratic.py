@@ -94,7 +94,7 @@ class LocalModel:
         return error / max(float(change.square().sum()), math.ulp(0.0))
 
 
-def coefficients(n: int) -> int:
+def coefficient_count(n: int) -> int:
     """Return the number of coefficients of a quadratic in n parameters."""
     return (n + 1) * (n + 2) // 2
 
@@ -157,7 +157,7 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     known = best.whiten(root[:, None] * s / n).square().sum(0)
     bent = best.whiten(root[:, None] * (s.square() + 0.5 * trace[:, None]) / n**2).square().sum(0)
     # The prior knows one size of curvature for all parameters. Fewer evaluations than coefficients determine no more.
-    told = len(u) >= coefficients(n)
+    told = len(u) >= coefficient_count(n)
     unknown = torch.full_like(bent, math.inf)
     at_zero = _CONSTANT * alpha.sum() - 0.25 * (alpha @ trace) / n
     return LocalModel(

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, factored, quadratic_terms, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, factored, quadratic_terms, symmetric
 
 _SPARE = 5
 """Evaluations beyond the coefficients of a quadratic, at least: the residuals give the standard errors."""
@@ -31,7 +31,7 @@ def quadratic_around(x: Tensor, points: Tensor, values: Tensor) -> tuple[LocalMo
     finite = torch.isfinite(values)
     points, values = points[finite], values[finite]
     n = len(x)
-    determined = coefficients(n)
+    determined = coefficient_count(n)
     distance, order = (points - x).norm(dim=1).sort()
     best, least = None, math.inf
     count = determined + max(_SPARE, n)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.surrogates.quadratic import coefficients
+from torch_zerohess.surrogates.quadratic import coefficient_count
 from torch_zerohess.surrogates.quadratic_around import quadratic_around
 from truths import normal
 
@@ -29,7 +29,7 @@ def test_a_quadratic_is_found_exactly(n):
     """Also where some of the losses are not finite."""
     f, hessian, center = quadratic(n)
     x = center + 0.5
-    points = scattered(x, 3 * coefficients(n) + 6)
+    points = scattered(x, 3 * coefficient_count(n) + 6)
     values = f(points)
     values[2::9] = math.nan
     values[3::9] = math.inf
@@ -44,10 +44,10 @@ def test_a_quadratic_is_found_exactly(n):
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_too_few_evaluations_tell_nothing(n):
     f, _, x = quadratic(n)
-    points = scattered(x, 3 * coefficients(n))
-    assert quadratic_around(x, points[: coefficients(n)], f(points[: coefficients(n)])) is None
+    points = scattered(x, 3 * coefficient_count(n))
+    assert quadratic_around(x, points[: coefficient_count(n)], f(points[: coefficient_count(n)])) is None
     lost = f(points)
-    lost[coefficients(n) :] = math.nan
+    lost[coefficient_count(n) :] = math.nan
     assert quadratic_around(x, points, lost) is None
     assert quadratic_around(x, points[:0], points[:0, 0]) is None
 
@@ -79,7 +79,7 @@ def test_standard_errors_cover_a_third_derivative(n):
         def cubic(z, slope=slope):
             return f(z) + ((z - x) @ slope) ** 3
 
-        points = x + 0.3 * normal(3 * coefficients(n) + n + 3, n, seed=100 + seed)
+        points = x + 0.3 * normal(3 * coefficient_count(n) + n + 3, n, seed=100 + seed)
         model, sigma, _ = quadratic_around(x, points, cubic(points))
         gradient_error, bend_error = model.full_errors()
         bend = (model.full_hessian() - sigma**2 * hessian).diagonal()

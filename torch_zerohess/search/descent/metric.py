@@ -26,7 +26,7 @@ from torch_zerohess.search.protocol.state import Best, Evaluated, are_same
 from torch_zerohess.search.region.method import RegionDescent
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.plateau import is_plateau
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, fit_values
 from torch_zerohess.surrogates.quadratic_around import quadratic_around
 
 MOST = 200
@@ -75,7 +75,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     progress = MetricProgress
 
     def __init__(self, settings: Settings) -> None:
-        fitted = min(coefficients(settings.n) + settings.n, _FITTED)
+        fitted = min(coefficient_count(settings.n) + settings.n, _FITTED)
         super().__init__(settings, fitted, settings.pool or max(_KEPT * fitted, _LEAST_KEPT))
         self._wide = SmoothedQuadratics(settings)
 

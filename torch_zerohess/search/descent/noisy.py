@@ -22,7 +22,7 @@ from torch_zerohess.search.protocol.random_points import normal
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress, not_finite
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.pool import latest
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, symmetric
 
 MOST = 40
 """Parameters up to which a regression is made at every step."""
@@ -97,7 +97,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         n = settings.n
-        self._coefficients = coefficients(n)
+        self._coefficients = coefficient_count(n)
         self._least = _FITTED * self._coefficients
         most = max(self._least, min(_MORE * self._coefficients, _ENOUGH))
         self._most = min(most, max(settings.pool // 2, 1)) if settings.pool else most
@@ -127,7 +127,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
             reason = f"{_STILL} steps in a row were within noise"
             return self._arrived(known, reason, generator)
         if known.sigma < _FINEST * self.settings.tolerance:
-            reason = f"sigma fell below {_FINEST * self.settings.tolerance:g} of the first one"
+            reason = f"the region around x fell below {_FINEST * self.settings.tolerance:g} of sigma"
             return self._arrived(known, reason, generator)
         return known, self._drawn(known, self.settings.n + 1, generator)
 

@@ -88,7 +88,7 @@ class SmoothedQuadratics(Method[DescentProgress]):
         else:
             known = replace(known, value=loss if known.phase == "start" else known.value).trying()
         if known.sigma < self.settings.tolerance:
-            reason = f"sigma fell below {self.settings.tolerance} of the first one"
+            reason = f"the region around x fell below {self.settings.tolerance} of sigma"
             known = self.arrive(known, reason, generator)
         return self._planned(known) if known.phase == "trial" and not known.done else known
 

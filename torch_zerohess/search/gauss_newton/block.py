@@ -28,7 +28,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.krylov import are_free
 from torch_zerohess.linalg.subproblem import damped_steps
-from torch_zerohess.search.gauss_newton.by_samples import LENGTHS, GaussNewton, JacobianProgress
+from torch_zerohess.search.gauss_newton.by_samples import STEP_LENGTHS, GaussNewton, JacobianProgress
 from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps, checked_steps, linear_outputs
 from torch_zerohess.search.protocol.ask_tell import AskTell
 from torch_zerohess.search.protocol.method import Settings
@@ -135,7 +135,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
 
     def arrived(self, known: BlockProgress) -> BlockProgress:
         """Begin again or end; it has arrived only where outputs change, and their linear model promises nothing."""
-        longest = known.center.new_tensor([LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
+        longest = known.center.new_tensor([STEP_LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
         promised = self.solved(known, longest).promised
         if bool(known.jacobian.any()) and (promised is None or promised <= LITTLE * abs(known.loss)):
             known = known.arriving(known.here)

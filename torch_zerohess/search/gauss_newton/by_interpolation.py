@@ -36,7 +36,7 @@ from torch_zerohess.search.region.progress import RegionProgress
 from torch_zerohess.surrogates.least_change import LeastNorm
 from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_then_slope
 from torch_zerohess.surrogates.pool import Pool, latest
-from torch_zerohess.surrogates.quadratic import coefficients
+from torch_zerohess.surrogates.quadratic import coefficient_count
 
 _PATIENCE = 5
 """Rejected steps in a row after which the method has failed."""
@@ -103,7 +103,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     _singular = 1e-16  # the square of units of outputs that differ by 1e6, and a margin
 
     def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:
-        super().__init__(settings, min(coefficients(settings.n), capacity), capacity)
+        super().__init__(settings, min(coefficient_count(settings.n), capacity), capacity)
         self._patience = _PATIENCE if patience is None else patience
         self._linear: tuple[Tensor, Tensor] | None = None  # output [m] and Jacobian [n, m] of the last quadratic
 

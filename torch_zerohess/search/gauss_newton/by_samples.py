@@ -18,7 +18,7 @@ from torch_zerohess.search.protocol.method import Method
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 
-LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
+STEP_LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
 SHRINKING = 0.4
 """Factor of the radius where no step lowers the loss."""
@@ -136,7 +136,7 @@ class GaussNewton(Method[Q]):
 
     def radii(self, known: Q) -> Tensor:
         """Return the lengths of the steps that are tried [k]."""
-        return known.center.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
+        return known.center.new_tensor(STEP_LENGTHS) * known.radius * math.sqrt(self.settings.n)
 
     def trials(self, known: Q) -> Tensor:
         """Return the ends of steps of all lengths [k, n]."""

@@ -22,7 +22,7 @@ from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import fractions, uniform
 from torch_zerohess.search.protocol.state import LOST, Evaluated
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count
 
 _NEAR = 0.1
 """Length below which a step of the process is short, in units of the first sigma sqrt(n)."""
@@ -105,7 +105,7 @@ class LossProcess(FinishedProcess[LossProgress]):
     def _foretold(self, known: LossProgress, points: Tensor) -> float:
         """Return the loss that a quadratic predicts at the first of the points; infinity if it is not determined."""
         pool = known.pool
-        if known.done or known.noisy or len(pool) < coefficients(self.settings.n):
+        if known.done or known.noisy or len(pool) < coefficient_count(self.settings.n):
             return math.inf
         quadratics = self.local.go_on(pool.points, pool.values, known.best, 1.0)
         return self.local.predicted(quadratics, points[0])
@@ -190,7 +190,8 @@ class LossProcess(FinishedProcess[LossProgress]):
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points
         elsewhere = float((now.best.point - best.point).norm()) > APART
         end = now.best if elsewhere and converged else None
-        known = self.arrived(known, "quadratics have arrived or found nothing better for a while", end)
+        reason = "quadratics have arrived" if converged else "quadratics found nothing better for a while"
+        known = self.arrived(known, reason, end)
         known = replace(known, several=known.several or (end is not None and known.agreed == 0))
         if known.beside or (elsewhere and not converged):
             return known.with_arrivals(agreed=0), points

@@ -20,7 +20,7 @@ from torch_zerohess.search.protocol.state import Best, Evaluated, not_finite
 from torch_zerohess.search.region.border import borders_between
 from torch_zerohess.search.region.progress import R, RegionProgress
 from torch_zerohess.surrogates.determined import with_true_errors
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, fit_values
 
 _FINEST = 1e-6
 """Sigma at which a round ends, over the tolerance of the search."""
@@ -68,7 +68,7 @@ class RegionDescent(Method[R]):
     def __init__(self, settings: Settings, fitted: int, capacity: int) -> None:
         super().__init__(settings)
         self._n = settings.n
-        self._coefficients = coefficients(settings.n)
+        self._coefficients = coefficient_count(settings.n)
         self._fitted, self._capacity = fitted, capacity
         self._finest = _FINEST * settings.tolerance
 
@@ -168,9 +168,9 @@ class RegionDescent(Method[R]):
                     return self._geometry(known, direction, generator)
             least = self._least_gain * abs(known.lowest.loss)
             if known.confirmed and known.sigma < settings.tolerance and promised <= least and known.hessian.any():
-                return self._arrived(known, "a step promises nothing where the last loss was predicted", generator)
+                return self._arrived(known, "the model predicts the loss near x, and no step lowers it", generator)
             known = replace(known, sigma=(_LEAPING if known.confirmed else _CLOSING) * known.sigma, confirmed=False)
-        reason = f"sigma fell below {self._finest:g} of the first one"
+        reason = f"the region around x fell below {self._finest:g} of sigma"
         return self._arrived(known, reason, generator)
 
     def more(self, known: R, points: Tensor, count: int, generator: torch.Generator) -> Tensor:

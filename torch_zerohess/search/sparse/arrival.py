@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.gauss_newton.by_samples import INSIDE, LENGTHS, SHRINKING, GaussNewton
+from torch_zerohess.search.gauss_newton.by_samples import INSIDE, STEP_LENGTHS, SHRINKING, GaussNewton
 from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.sparse.progress import SparseProgress
@@ -100,7 +100,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         found = self._thorough(known, self.radius * root, torch.zeros_like(known.center))
         assert found.promised is not None
         little = found.promised <= LITTLE * abs(known.loss)
-        short = float(found.steps.norm()) <= INSIDE * LENGTHS[-1] * self.settings.tolerance * root
+        short = float(found.steps.norm()) <= INSIDE * STEP_LENGTHS[-1] * self.settings.tolerance * root
         return None if little or short else found.steps[0]
 
     def _doubting(self, known: SparseProgress, step: Tensor) -> SparseProgress:

@@ -10,7 +10,7 @@ from searches import Linear, run, square, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.search.gauss_newton.block import broyden_update
-from torch_zerohess.search.gauss_newton.by_samples import LENGTHS
+from torch_zerohess.search.gauss_newton.by_samples import STEP_LENGTHS
 from truths import normal
 
 
@@ -59,8 +59,8 @@ def test_linear_least_squares_take_one_jacobian_and_one_step(n, m):
     lowest = float((torch.linalg.lstsq(a.mT, b[:, None]).solution[:, 0] @ a - b).square().mean())
     search = zh.optim.BlockGaussNewton(torch.zeros(n).double(), sigma=8.0, loss=square(b), seed=0)
     assert search.ask().shape == (1 + n, n)
-    run(search, lambda x: x @ a, 1 + n + len(LENGTHS))
-    assert search.evaluations == 1 + n + len(LENGTHS)
+    run(search, lambda x: x @ a, 1 + n + len(STEP_LENGTHS))
+    assert search.evaluations == 1 + n + len(STEP_LENGTHS)
     assert search.iterations == 1
     assert search.value - lowest < 1e-5 * float(b.square().mean())
 
@@ -75,7 +75,7 @@ def test_the_curvature_of_any_loss_is_used():
         return (w * (y - b).square()).sum() / 2
 
     search = zh.optim.BlockGaussNewton(torch.zeros(n).double(), sigma=10.0, loss=loss, seed=0)
-    run(search, lambda x: x @ a, 1 + n + len(LENGTHS))
+    run(search, lambda x: x @ a, 1 + n + len(STEP_LENGTHS))
     lowest, first = float(loss(best @ a)), float(loss(torch.zeros(m)))
     assert search.value - lowest < 1e-3 * (first - lowest)
 
@@ -118,7 +118,7 @@ def test_the_decrease_to_a_minimum_within_reach_is_promised_and_no_other():
         search.tell(outputs(search.ask()))
         if search.promise < math.inf:
             assert search.promise == pytest.approx(search.value, rel=0.1)  # the least loss is 0
-            assert float((search.x - 3.0).norm()) < LENGTHS[-1] * float(search.width.norm())
+            assert float((search.x - 3.0).norm()) < STEP_LENGTHS[-1] * float(search.width.norm())
             reached += 1
         else:
             assert bool((search.width == math.inf).all())
@@ -286,7 +286,7 @@ def test_a_limit_leaves_the_rest_for_later():
     # The samples that a limit left out come in the next batches: the same 21 points in the end.
     torch.testing.assert_close(torch.cat(asked), first)
     assert search.evaluations == 21
-    assert len(search.ask()) == len(LENGTHS)
+    assert len(search.ask()) == len(STEP_LENGTHS)
 
 
 def test_single_precision_and_units_per_parameter():

@@ -10,7 +10,7 @@ from searches import texels as image
 
 import torch_zerohess as zh
 from torch_zerohess.optim import LocalGaussNewton
-from torch_zerohess.search.gauss_newton.by_samples import LENGTHS
+from torch_zerohess.search.gauss_newton.by_samples import STEP_LENGTHS
 from torch_zerohess.search.protocol.state import Arrivals, Evaluated
 from torch_zerohess.search.sparse import arrival
 from torch_zerohess.search.sparse.steps import sparse_steps
@@ -48,7 +48,7 @@ def test_a_jacobian_that_predicts_well_is_trusted_in_long_steps_and_kept(f, radi
     search.tell(f(search.ask()))
     points = search.ask()
     lengths = (points - search.center).norm(dim=1) / math.sqrt(N)
-    assert lengths.tolist() == pytest.approx([radius * one for one in LENGTHS])
+    assert lengths.tolist() == pytest.approx([radius * one for one in STEP_LENGTHS])
     search.tell(f(points))
     assert len(search.ask()) == asked
 
@@ -554,5 +554,5 @@ def test_a_promise_takes_no_more_solutions_than_the_steps_do(monkeypatch):
     search = search_for(image, normal(N))
     search.tell(image(search.ask()))
     assert search.promise < math.inf
-    assert len(search.ask()) == len(LENGTHS)
+    assert len(search.ask()) == len(STEP_LENGTHS)
     assert len(solved) == 1

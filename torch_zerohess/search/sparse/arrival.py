@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.gauss_newton.by_samples import INSIDE, STEP_LENGTHS, SHRINKING, GaussNewton
+from torch_zerohess.search.gauss_newton.by_samples import INSIDE, SHRINKING, STEP_LENGTHS, GaussNewton
 from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.sparse.progress import SparseProgress

@@ -99,7 +99,8 @@ def estimate(
     call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head, joint)
     check_limits(tolerance, tolerance_of, max_evaluations)
     _check_memory(call, aux, memory, tolerance)
-    check_no_derivative(NO_GRAPH, x=checked_input(x), **{f"aux[{k}]": one for k, one in enumerate(aux)})
+    tensors = {f"aux[{k}]": one for k, one in enumerate(aux) if isinstance(one, Tensor)}
+    check_no_derivative(NO_GRAPH, x=checked_input(x), **tensors)
     x = checked_input(x).detach().clone()
     if joint and (x.ndim != 2 or head is not None or memory is not None):
         raise ValueError(

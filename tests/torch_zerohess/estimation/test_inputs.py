@@ -148,7 +148,7 @@ FUNCTIONS = [
     (lambda z: (squares(z) * 1j).numpy(), TypeError, r"fn must return real numbers, got torch\.complex128"),
     (lambda z: None, TypeError, "fn must return a tensor or a NumPy array of numbers, got NoneType"),
     (lambda z: "f", TypeError, "fn must return a tensor or a NumPy array of numbers, got str"),
-    (lambda z: {"loss": squares(z)}, TypeError, "fn must return a tensor or a NumPy array of numbers, got dict"),
+    (lambda z: {"loss": squares(z)}, TypeError, "got a dict of 'loss': return one of its values"),
     (lambda z: squares(z).requires_grad_(), ValueError, r"fn returned a tensor that requires grad.*detached"),
     (
         lambda z: squares(z) + math.nan,

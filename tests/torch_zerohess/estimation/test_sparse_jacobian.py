@@ -216,6 +216,7 @@ def test_neighbours_share_evidence_in_every_layout_of_images(dims):
 def test_one_point_at_a_time():
     J = zh.sparse_jacobian(lambda z: scaled(z)[0], torch.zeros(N).double(), smoothing(), vectorized=False)
     assert J.shape == (SIDE, SIDE)
+    torch.testing.assert_close(J.dense().view(N, N), torch.diag(SCALES), atol=3e-3, rtol=0)
 
 
 @pytest.mark.parametrize(

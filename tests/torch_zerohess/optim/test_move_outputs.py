@@ -144,10 +144,12 @@ def test_a_network_in_which_one_module_stands_twice_keeps_its_buffers() -> None:
 
 def test_matrix_products_of_lower_precision_mix_no_samples() -> None:
     torch.manual_seed(0)
-    layers = [nn.Linear(64, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 4)]
-    before = torch.get_float32_matmul_precision()
+    network = nn.Sequential(nn.Linear(64, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 4))
+    x, change = torch.randn(64, 64), 0.01 * torch.randn(64, 4)
+    before, precision = network(x).detach(), torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("medium")
     try:
-        zh.optim.move_outputs(nn.Sequential(*layers), torch.randn(64, 64), 0.01 * torch.randn(64, 4))
+        zh.optim.move_outputs(network, x, change)
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_float32_matmul_precision(precision)
+    assert float((network(x).detach() - before - change).norm()) < 0.5 * float(change.norm())  # a damped step

@@ -40,9 +40,9 @@ def checked_input(x: Any, *, empty: bool = False) -> Tensor:
 
 
 def check_no_derivative(instead: str, **given: Tensor) -> None:
-    """Raise ValueError if a transform of torch maps over a tensor, or differentiates it: results have no graph.
+    """Raise ValueError if a transform of torch maps over a tensor, or differentiates it: the result has no graph.
 
-    instead: "where such a result has none: use this", for the message.
+    instead: end of the message, which says what has no graph and what to use.
     """
     for name, one in given.items():
         _check_not_mapped(name, one)

@@ -219,7 +219,7 @@ def _reseed(generator: Any) -> None:
         generator.seed(seed)
     elif (bits := getattr(generator, "bit_generator", None)) is not None:
         bits.state = type(bits)(seed).state
-    else:  # normal numbers come in pairs, of which the second is a part of the state
+    else:  # normal numbers are drawn in pairs, and the state keeps the second one
         generator.set_state(type(generator._bit_generator)(seed).state | {"has_gauss": 0, "gauss": 0.0})
 
 

@@ -6,12 +6,15 @@ from torch_zerohess.minimization.record import Record
 from torch_zerohess.minimization.wording import REMEDY
 
 _MANY = 50
-"""Evaluations after which equal values are a warning. If the value differed at one point of seventeen, so many equal
-ones would have a probability of 5 %."""
+"""Evaluations after which equal values are a warning. If the value differed at one point of seventeen, fifty equal
+values would have a probability of 5 %."""
 
 
 def warn_of_constant(record: Record, before: int) -> None:
-    """Warn if there are now fifty evaluations, `before` there were fewer, and all values are equal to the last bit."""
+    """Warn once, when the record reaches fifty evaluations, if all values are equal to the last bit.
+
+    before: number of evaluations before the latest batch.
+    """
     if not before < _MANY <= record.complete or not record.flat:
         return
     if record.has_outputs and not record.same_outputs:

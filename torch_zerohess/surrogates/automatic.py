@@ -18,11 +18,13 @@ from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted
 
 _PROCESS = 32
 """Parameters up to which a Gaussian process is tried; in more, distances say little."""
-_HELD_OUT, _COMPARED = 5, 1000
-"""One point in so many is held out to compare the two, of so many points at most, drawn at random."""
+_HELD_OUT = 5
+"""One point in so many is held out to compare a process with an affine map."""
+_COMPARED = 1000
+"""Points in this comparison, at most; they are drawn at random."""
 _BETTER = 0.99
-"""Squared error of the process, over the error of the affine map, from which on the affine map is taken: it needs no
-draws, and takes far less time."""
+"""The process is taken if its squared error is below this share of the squared error of the affine map. The affine map
+needs no draws, and takes far less time."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
 _RANK = 128
@@ -30,9 +32,11 @@ _RANK = 128
 _EXACT = 1e-6
 """Share of the change of held-out outputs that a sparse map may leave, where the map of least norm leaves less: the
 sparse one takes far less time, and images have larger rounding."""
-_TRIED, _CLEARLY = 2, 1.25
-"""Points per parameter to which a sparse map of a few elements is fitted first, and how many times the share that least
-norm leaves it leaves where more is not worth the time."""
+_TRIED = 2
+"""Points per parameter to which a sparse map of a few elements is fitted first."""
+_CLEARLY = 1.25
+"""Share of the change that this sparse map leaves, over the share that the map of least norm leaves, above which the
+outputs are dense: a sparse map of all elements is then not worth the time."""
 _FEW = 3
 """Points per parameter below which each point is left out once to measure the map of least norm."""
 

@@ -5,12 +5,12 @@ interpolate the values. Powell's method takes the quadratic whose Hessian is nea
 Frobenius norm. It is unique once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic
 models"). It is the mean of a Gaussian process: the entries of the change of the Hessian are independent normal numbers.
 
-The process here differs in three ways. On the way to a minimum all curvatures often grow or fall together. So a
-multiple of the identity is added, with a normal factor; beyond four parameters also a multiple of the earlier Hessian,
-as in self-scaling quasi-Newton methods (Oren and Luenberger 1974). And a value at u differs from the quadratic
-by a normal number whose variance grows as |u|^6. How fast it grows depends on the function. Many values choose between
-two rates by their likelihoods (Rasmussen and Williams 2006, section 5.4). Few values get the faster rate: quadratics
-through far points fit them nearly always, and the slopes of these quadratics are wrong.
+The process here differs in two ways. On the way to a minimum all curvatures often grow or fall together. So the change
+also has a multiple of the identity, with a normal factor. With more than four parameters it also has a multiple of the
+earlier Hessian, as in self-scaling quasi-Newton methods (Oren and Luenberger 1974). And a value at u differs from the
+quadratic by a normal number whose variance grows as |u|^6. How fast it grows depends on the function. Many values
+choose between two rates by their likelihoods (Rasmussen and Williams 2006, section 5.4). Few values get the faster
+rate: quadratics through far points fit them nearly always, and the slopes of these quadratics are wrong.
 """
 
 import math
@@ -32,9 +32,9 @@ nearly always choose `_CUBIC`."""
 _ALIKE = 1.0
 """Variance of the multiple of the identity, over the variance of an entry beside the diagonal."""
 _SCALED = 10.0
-"""Variance of the multiple of the earlier Hessian, which has the Frobenius norm of the identity here."""
+"""Like `_ALIKE`, for the multiple of the earlier Hessian, divided by its Frobenius norm and times that of I."""
 _TOLD = 4
-"""Parameters up to which the values soon tell all curvatures, and the earlier Hessian is not multiplied."""
+"""Parameters up to which the values soon tell all curvatures, so that no multiple of the earlier Hessian is needed."""
 _LIKELIER = 20.0
 """`_ROUGH` is taken where it makes the values more than so many times as likely as `_CUBIC` does."""
 _FREE = 1e-12
@@ -56,10 +56,10 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
     likelihood of the values says so.
     """
     n = u.shape[1]
-    bend = ((u @ hessian) * u).sum(1)
-    rest = values - 0.5 * bend
+    curved = ((u @ hessian) * u).sum(1)
+    rest = values - 0.5 * curved
     scale = (_SCALED * n) ** 0.5 / (float(hessian.norm()) or 1.0) if n > _TOLD else 0.0
-    bend = scale * bend
+    bend = scale * curved
     if len(u) < _FEW * coefficient_count(n):
         fit = _Affine.through(u, values, rest, bend, _OF_FEW)
     else:
@@ -82,13 +82,13 @@ class _Affine:
     left: Tensor
     """Deviations of the values less the earlier Hessian, divided by the factor [P]."""
     likelihood: float
-    """Logarithm of the restricted likelihood of the values, without an earlier Hessian, at the likeliest scale."""
+    """Logarithm of the restricted likelihood of the values, not of the `rest`, at the likeliest scale."""
 
     @classmethod
     def through(cls, u: Tensor, values: Tensor, rest: Tensor, bend: Tensor, cubic: float) -> "_Affine":
         """Fit values [P] at u [P, n], for the likelihood, and the `rest` of them less the earlier Hessian [P].
 
-        bend: u.H u [P] of a Hessian H whose multiple is added.
+        bend: u.H u [P] of the Hessian H whose multiple the change has.
         """
         P, n = u.shape
         factor = _factor(u, cubic, _ALIKE, bend)

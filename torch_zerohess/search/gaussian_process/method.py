@@ -258,7 +258,7 @@ class ProcessMethod(Method[Q]):
         values = (values - least) / spread  # neither their squares nor that of the noise overflow
         noise = self.settings.noise / spread
         looks = noise > 0.0 and known.iterations % LOOK == 0
-        if noise and not looks:  # a warp is the identity where losses are low, so that of the best point stays
+        if noise and not looks:  # a warp changes high losses alone: the best point keeps its loss
             values = warped(known.pool.points, values, noise, self._structures)
         known, process = self._fitted(known, values[:, None], noise)
         if known.noisy:

@@ -5,8 +5,8 @@ The slope is 1 where losses are low, so noise keeps its standard deviation there
 than the process takes it to be. The evidence of the process chooses u, as it chooses the kernel: the likelihood of y
 times the slopes dy/dv is a likelihood of v (Snelson, Rasmussen and Ghahramani 2004).
 
-A process of logarithms expects nothing lower in other basins, whose flanks are all it knows of them. So one step in
-`LOOK` is by a process of the losses as they are. It moves no best point: it does not resolve low losses.
+A process of logarithms knows only the flanks of other basins, and expects nothing lower there. So one step in `LOOK` is
+by a process of the losses as they are. This step does not move the best point: its process does not resolve low losses.
 """
 
 import math
@@ -18,7 +18,7 @@ from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, grid
 from torch_zerohess.surrogates.kernels import Structure
 
 LOOK = 4
-"""Steps of which one looks for other basins."""
+"""One step in so many looks for other basins."""
 _UNITS = (300.0, 30.0)
 """Units u of a warp, over the noise, to choose from. No warp is the third choice."""
 

@@ -60,7 +60,7 @@ class Smoothing:
             by orders of magnitude, and not the expectation. With sampler "sobol" the draws are scrambles, and samples
             must be even for "mean".
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
-            directions (proposals "aggregate" and "gaussian").
+            directions, normal ones. Then the dimensions that a lobe or the box is in get quantiles of it.
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
             perturbations: every call uses the same ones, whatever the number of threads. With a `Memory`, and with an
             earlier `SparseJacobian`, they also depend on the number of evaluations that it has taken. Layers in
@@ -117,15 +117,6 @@ class Smoothing:
             raise ValueError(f"scrambles must divide samples, got {self.scrambles} of {self.samples}")
         if self.scrambles is not None and self.sampler != "sobol":
             raise ValueError(f"scrambles need sampler 'sobol', got {self.scrambles} with sampler {self.sampler!r}")
-        if self.sampler == "orthogonal" and self.proposal not in ("aggregate", "gaussian", "auto"):
-            raise ValueError(
-                f"sampler 'orthogonal' makes normal directions: proposal must be 'aggregate' or 'gaussian', "
-                f"got {self.proposal!r}"
-            )
-        if self.sampler == "sobol" and self.proposal == "optimal":
-            raise ValueError(
-                "proposal 'optimal' draws one small set per element: sampler must be 'random', got 'sobol'"
-            )
         if self.baseline == "mean" and self.proposal != "optimal":
             self._check_draws()
 

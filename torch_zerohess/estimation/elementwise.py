@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.estimation.skewness import Shape, shape_of
 from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein, completed
-from torch_zerohess.sampling import kernels, proposals
+from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.sampling.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
 from torch_zerohess.smoothing import Smoothing
 
@@ -45,7 +45,7 @@ class Elementwise(Stein):
         rows = elements.repeat(B, 1)
         rows[:, 1] = torch.arange(len(rows), device=x.device)
         points, u, _ = kernels.place(
-            kernels.draw(rows, n),
+            samplers.of_elements(rows, n, smoothing),
             x.double().contiguous(),
             sigma,
             smoothing.paired,
@@ -131,7 +131,7 @@ class Elementwise(Stein):
         """Spread of the S draws of each element, which are the only ones that estimate it: S - 1 degrees of freedom.
 
         The hvp is a sum of elements with their own variances; its degrees are by Welch and Satterthwaite. Raises
-        ValueError if an element has one sample.
+        ValueError if an element has one draw.
         """
         if quantity not in ("value", "gradient") and self.first_order:
             raise ValueError(FIRST_ORDER_ERROR)
@@ -139,7 +139,10 @@ class Elementwise(Stein):
         groups = 1 + self.n + (0 if self.first_order else self.n * (self.n + 1) // 2)
         S = len(index) // groups
         if S < 2:
-            raise ValueError("a standard error of proposal 'optimal' needs at least 2 samples per element, got 1")
+            raise ValueError(
+                "a standard error of proposal 'optimal' needs at least 2 independent draws per element, got 1: use at "
+                "least 2 samples, with sampler 'sobol' an even number and scrambles None or at least 2"
+            )
         # The value of a draw is f itself: relative to the mean of the others, draws would seem to be further apart.
         used = pooled if quantity == "value" and pooled is not None else a
         y = (used * self.weight[:, None])[:, :, index].sum(3).unflatten(2, (groups, S))

@@ -1,7 +1,8 @@
 """Perturbations u [R, n] of a batch of B estimates with S samples each, R = B * S: random, Sobol, orthogonal.
 
 Each row has the same distribution with all three samplers. They differ in how the rows of one estimate depend on each
-other. Rows that depend on each other form one independent draw of `draw_size` consecutive samples.
+other. Rows that depend on each other form one independent draw of `draw_size` consecutive samples. With proposal
+"optimal" the set of samples of each element is an estimate of its own.
 """
 
 import torch
@@ -11,7 +12,7 @@ from torch_zerohess.choice import scrambles_of
 from torch_zerohess.sampling import kernels
 from torch_zerohess.sampling.kernels import shape, uniforms, with_lobes
 from torch_zerohess.sampling.philox import EXTRA
-from torch_zerohess.sampling.proposals import NORMAL, mixture_rows
+from torch_zerohess.sampling.proposals import NORMAL, SIGNED_LOBES, UNIFORM, mixture_rows
 from torch_zerohess.smoothing import Smoothing
 
 _SOBOL_BITS = 30
@@ -28,16 +29,24 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
         return samples // smoothing.scrambles
     if smoothing.sampler == "sobol":
         return samples // scrambles_of(samples, 8)
+    if smoothing.proposal == "optimal":  # the sets of all elements have blocks of one size
+        return next(size for size in range(max(1, min(n, samples // 2)), 0, -1) if samples % size == 0)
     # Two blocks have a standard error; with a mean of the others it takes three.
     return min(n, max(1, samples // 3) if smoothing.baseline == "mean" else (samples + 1) // 2)
 
 
 def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
-    """Scrambled Sobol points: u [R, n].
+    """Scrambled Sobol points: u [R, n]. Raises ValueError if n is over 21 198."""
+    index, p = _scrambled(seed, batch, n, smoothing, device)
+    rows = mixture_rows(torch.full_like(index, seed), index, p[:, n:], n, proposal)
+    return shape(rows, p[:, :n])
 
-    Each independent scramble is a linear matrix scramble (Matousek 1998), shared by the batch, and a digital shift,
-    one per batch element. The sequence has thirty bits; the bits below them are random. Raises ValueError if n is over
-    21 198.
+
+def _scrambled(seed: int, estimates: int, n: int, smoothing: Smoothing, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the indices [R] of all rows and their points [R, n + 3], for sets of `smoothing.samples` rows.
+
+    Each independent scramble is a linear matrix scramble (Matousek 1998), shared by the sets, and a digital shift, one
+    per set. The sequence has thirty bits; the bits below them are random.
     """
     if n + 3 > torch.quasirandom.SobolEngine.MAXDIM:
         most = torch.quasirandom.SobolEngine.MAXDIM - 3
@@ -48,34 +57,48 @@ def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, de
     seeds = uniforms(torch.full_like(each, seed), each, 0, 1, EXTRA)[:, 0]
     engines = [torch.quasirandom.SobolEngine(n + 3, scramble=True, seed=int(one * 2**62)) for one in seeds]
     points = torch.stack([engine.draw(size, dtype=torch.float64) for engine in engines]).to(device)
-    index = torch.arange(batch * smoothing.samples, device=device)
-    shifted = _SHIFTS + torch.arange(batch * scrambles, device=device)
+    index = torch.arange(estimates * smoothing.samples, device=device)
+    shifted = _SHIFTS + torch.arange(estimates * scrambles, device=device)
     shifts = (uniforms(torch.full_like(shifted, seed), shifted, 0, n + 3, EXTRA) * 2**_SOBOL_BITS).long()
-    bits = (points * 2**_SOBOL_BITS).long() ^ shifts.view(batch, scrambles, 1, n + 3)
+    bits = (points * 2**_SOBOL_BITS).long() ^ shifts.view(estimates, scrambles, 1, n + 3)
     jitter = uniforms(torch.full_like(index, seed), _JITTER + index, 0, n + 3, EXTRA)
     p = (bits.reshape(jitter.shape) + jitter) * 2.0**-_SOBOL_BITS
-    p = p.clamp(_HALF_ULP, 1.0 - _HALF_ULP)
-    rows = mixture_rows(torch.full_like(index, seed), index, p[:, n:], n, proposal)
-    return shape(rows, p[:, :n])
+    return index, p.clamp(_HALF_ULP, 1.0 - _HALF_ULP)
 
 
 def orthogonal(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
     """Blocks of orthogonal directions with independent chi-distributed lengths (Yu et al. 2016): u [R, n].
 
+    Proposals without a Gaussian share get the quantiles that belong to the normal ones, so that signs stay.
+    """
+    rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
+    normal = _directions(rows, n, smoothing)
+    if proposal in (UNIFORM, SIGNED_LOBES):
+        return shape(rows, torch.special.ndtr(normal).clamp(_HALF_ULP, 1.0 - _HALF_ULP))
+    return _lobes_in(normal, rows)
+
+
+def _directions(rows: Tensor, n: int, smoothing: Smoothing) -> Tensor:
+    """Return normal directions [R, n], in sets of `smoothing.samples` rows that consist of orthogonal blocks.
+
     The orthonormal factor of a Gaussian matrix is independent of the lengths of its rows. So each direction is scaled
     by the length of its own row, and every row is N(0, I).
     """
-    rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
     plain = rows.clone()
     plain[:, 2], plain[:, 3:] = NORMAL, 0
-    gaussian = kernels.draw(plain, n).view(batch, smoothing.samples, n)
+    gaussian = kernels.draw(plain, n).view(-1, smoothing.samples, n)
     size = draw_size(smoothing, n)
     whole = smoothing.samples // size * size
-    blocks = [_orthogonalized(gaussian[:, :whole].reshape(-1, size, n)).view(batch, whole, n)]
+    blocks = [_orthogonalized(gaussian[:, :whole].reshape(-1, size, n)).view(-1, whole, n)]
     if whole < smoothing.samples:
         blocks.append(_orthogonalized(gaussian[:, whole:]))
+    return torch.cat(blocks, 1).flatten(0, 1)
+
+
+def _lobes_in(u: Tensor, rows: Tensor) -> Tensor:
+    """Return directions u [R, n] with the lobes of their rows, from independent noise."""
     p = uniforms(rows[:, 0], rows[:, 1], 0, 2, EXTRA)
-    return with_lobes(rows, torch.cat(blocks, 1).flatten(0, 1), p[:, 0], p[:, 1])
+    return with_lobes(rows, u, p[:, 0], p[:, 1])
 
 
 def _orthogonalized(block: Tensor) -> Tensor:
@@ -93,6 +116,14 @@ def _orthogonalized(block: Tensor) -> Tensor:
 def random(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
     """Independent u [R, n]."""
     return kernels.draw(kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device), n)
+
+
+def of_elements(rows: Tensor, n: int, smoothing: Smoothing) -> Tensor:
+    """Perturbations [R, n] of optimal sampling, for rows as made by `proposals.element_rows`, sets one by one."""
+    if smoothing.sampler == "sobol":
+        _, p = _scrambled(int(rows[0, 0]), len(rows) // smoothing.samples, n, smoothing, rows.device)
+        return shape(rows, p[:, :n])
+    return kernels.draw(rows, n) if smoothing.sampler == "random" else _lobes_in(_directions(rows, n, smoothing), rows)
 
 
 SAMPLERS = {"random": random, "sobol": sobol, "orthogonal": orthogonal}

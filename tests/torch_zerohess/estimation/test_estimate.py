@@ -20,17 +20,13 @@ from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
 from truths import ClosedForm, Exponential, Image, PlaneWave, Quadratic, deviation, spread, truths, vector
 
-PROPOSALS = {
-    "aggregate": ["random", "sobol", "orthogonal"],
-    "gaussian": ["random", "sobol", "orthogonal"],
-    "optimal": ["random"],
-    "uniform": ["random", "sobol"],
-    "fr22": ["random", "sobol"],
-}
+PROPOSALS = ("aggregate", "gaussian", "optimal", "uniform", "fr22")
+SAMPLERS = ("random", "sobol", "orthogonal")
 GRID = [
     (proposal, sampler, baseline, antithetic)
-    for proposal, samplers in PROPOSALS.items()
-    for sampler, baseline, antithetic in itertools.product(samplers, ("center", "mean", "none"), (True, False))
+    for proposal, sampler, baseline, antithetic in itertools.product(
+        PROPOSALS, SAMPLERS, ("center", "mean", "none"), (True, False)
+    )
 ]
 V = vector(0.7, -1.1)
 SCALAR = PlaneWave(vector(0.9, -1.3), 0.4)
@@ -236,6 +232,12 @@ CALIBRATED = [
     ("optimal", "random", "mean", False),
     ("uniform", "random", "center", True),
     ("fr22", "random", "center", True),
+    ("fr22", "orthogonal", "center", True),
+    ("uniform", "orthogonal", "none", False),
+    ("optimal", "sobol", "center", True),
+    ("optimal", "sobol", "mean", False),
+    ("optimal", "orthogonal", "center", True),
+    ("optimal", "orthogonal", "mean", False),
 ]
 
 

@@ -66,10 +66,6 @@ SETTINGS = [
     ({"seed": 1.5}, TypeError, r"seed must be an integer, got 1\.5"),
     ({"order": 3}, ValueError, "order must be 1 or 2, got 3"),
     ({"order": 0}, ValueError, "order must be at least 1, got 0"),
-    ({"sampler": "orthogonal", "proposal": "optimal"}, ValueError, "proposal must be .*got 'optimal'"),
-    ({"sampler": "orthogonal", "proposal": "uniform"}, ValueError, "proposal must be .*got 'uniform'"),
-    ({"sampler": "orthogonal", "proposal": "fr22"}, ValueError, "proposal must be .*got 'fr22'"),
-    ({"sampler": "sobol", "proposal": "optimal"}, ValueError, "sampler must be 'random', got 'sobol'"),
     ({"sampler": "sobol", "scrambles": 3}, ValueError, "scrambles must divide samples, got 3 of 8"),
     ({"sampler": "sobol", "scrambles": 0}, ValueError, "scrambles must be at least 1, got 0"),
     ({"sampler": "sobol", "scrambles": True}, TypeError, "scrambles must be an integer, got True"),
@@ -333,7 +329,14 @@ OTHERS = [
     (
         lambda: estimate(squares, X, ONE.replace(proposal="optimal")).standard_error("value"),
         ValueError,
-        "at least 2 samples per element, got 1",
+        "at least 2 independent draws per element, got 1: use at least 2 samples, with sampler 'sobol' an even number",
+    ),
+    (
+        lambda: estimate(squares, X, ONE.replace(proposal="optimal", samples=3, sampler="sobol")).standard_error(
+            "value"
+        ),
+        ValueError,
+        "at least 2 independent draws per element, got 1: .* 'sobol' an even number",
     ),
     (
         lambda: estimate(lambda z: squares(z) * torch.where(z[:, 0] == X[0], 1.0, math.nan), X, S, on_nonfinite="drop"),

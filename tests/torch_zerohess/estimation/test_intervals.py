@@ -310,7 +310,14 @@ SLOPE = Exponential(vector(0.9, -1.3))
 
 @pytest.mark.parametrize(
     ("proposal", "sampler"),
-    [("aggregate", "random"), ("aggregate", "sobol"), ("aggregate", "orthogonal"), ("optimal", "random")],
+    [
+        ("aggregate", "random"),
+        ("aggregate", "sobol"),
+        ("aggregate", "orthogonal"),
+        ("optimal", "random"),
+        ("optimal", "sobol"),
+        ("optimal", "orthogonal"),
+    ],
 )
 def test_drawing_up_to_a_tolerance(proposal: str, sampler: str) -> None:
     smoothing = Smoothing(sigma=SIGMA, samples=8, proposal=proposal, sampler=sampler, seed=4)

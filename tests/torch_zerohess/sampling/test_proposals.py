@@ -99,8 +99,10 @@ CONFIGURATIONS = [
     ("gaussian", "orthogonal", 2),
     ("uniform", "random", 2),
     ("uniform", "sobol", 2),
+    ("uniform", "orthogonal", 2),
     ("fr22", "random", 2),
     ("fr22", "sobol", 2),
+    ("fr22", "orthogonal", 2),
 ]
 DENSITY = {
     ("aggregate", 2): proposals.SECOND_ORDER,

@@ -49,6 +49,10 @@ def test_draw_size_of_other_settings() -> None:
     for samples, n, size in ((12, 3, 3), (12, 10, 4), (7, 10, 2), (2, 10, 1)):
         mean = Smoothing(sigma=1.0, samples=samples, sampler="orthogonal", baseline="mean")
         assert samplers.draw_size(mean, n) == size
+    # "optimal": blocks of one size, at least two of them, in the set of each element.
+    for samples, n, size in ((12, 3, 3), (12, 10, 6), (10, 3, 2), (7, 10, 1), (1, 10, 1)):
+        optimal = Smoothing(sigma=1.0, samples=samples, sampler="orthogonal", proposal="optimal")
+        assert samplers.draw_size(optimal, n) == size
 
 
 def test_orthogonal_blocks_are_independent_of_each_other() -> None:
@@ -104,6 +108,40 @@ def test_every_scramble_has_one_point_in_each_of_its_cells() -> None:
     """8 scrambles of 4096 points: their first 12 bits are all different in every dimension."""
     cells = (torch.special.ndtr(drawn("sobol", 1, 1, 8 * 4096)) * 4096).long().view(8, 4096)
     assert torch.equal(cells.sort(1).values, torch.arange(4096).expand(8, 4096))
+
+
+def elements(sampler: str, samples: int, n: int) -> Tensor:
+    """Perturbations [sets, samples, n] of optimal sampling; the first set is the one of the value: normal ones."""
+    smoothing = Smoothing(sigma=1.0, samples=samples, proposal="optimal", sampler=sampler)
+    rows = proposals.element_rows(5, 0, samples, n, 2)
+    return samplers.of_elements(rows, n, smoothing).view(-1, samples, n)
+
+
+def test_every_element_has_sobol_points_of_its_own() -> None:
+    """Set by set, 4 scrambles of 8 points have one point in each eighth of a dimension without a lobe."""
+    u = elements("sobol", 32, 2)
+    normal = [u[0, :, 0], u[0, :, 1], u[1, :, 1], u[2, :, 0], u[3, :, 1], u[5, :, 0]]
+    cells = (torch.special.ndtr(torch.stack(normal)) * 8).long().view(-1, 4, 8)
+    assert torch.equal(cells.sort(2).values, torch.arange(8).expand(6, 4, 8))
+    assert len(torch.stack(normal).unique()) == 6 * 32  # no set has the points of another one
+
+
+def test_every_element_has_orthogonal_directions_of_its_own() -> None:
+    u = elements("orthogonal", 6, 3)
+    value, slope = u[0].view(2, 3, 3), u[1].view(2, 3, 3)
+    for block in value:
+        assert float((block @ block.T).triu(1).abs().max()) < 1e-12
+    assert float((value[0] @ value[1].T).abs().min()) > 1e-3  # blocks are independent of each other
+    assert float((slope[0] @ slope[0].T).triu(1).abs().max()) > 1e-3  # a lobe is drawn apart
+    assert float((value - slope).abs().min()) > 1e-6
+
+
+@pytest.mark.parametrize("proposal", [proposals.SIGNED_LOBES, proposals.UNIFORM])
+def test_lobes_and_boxes_keep_the_signs_of_orthogonal_directions(proposal: int) -> None:
+    """Of (a, b) and the orthogonal (-b, a) the product of all four numbers is negative."""
+    smoothing = Smoothing(sigma=1.0, samples=4, sampler="orthogonal")
+    u = samplers.SAMPLERS["orthogonal"](5, 500, 2, smoothing, proposal, CPU).view(-1, 2, 2)
+    assert bool((u.prod(2).prod(1) < 0).all())
 
 
 class Edge:

@@ -77,8 +77,8 @@ def minimize(
 
     Args:
         fn: [K, n] -> [K] or [K, 1], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and
-            anything else that cannot be differentiated is fine. Return NaN for a point that cannot be computed, and the
-            search avoids it. An exception ends the search.
+            anything else that cannot be differentiated is fine. Return NaN for a point that cannot be computed, a
+            single one also in place of an output, and the search avoids it. An exception ends the search.
         x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution. One that is wider
             than the bounds of a parameter are apart counts as their distance.

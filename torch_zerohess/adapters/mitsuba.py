@@ -35,6 +35,7 @@ from torch_zerohess.adapters.mitsuba_values import Value
 from torch_zerohess.adapters.mitsuba_variants import select_variant
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.process_identity import own_seed
+from torch_zerohess.evaluators.values import as_tensor
 
 __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
 
@@ -80,7 +81,7 @@ class MitsubaScene:
             batch has its own noise, since each part is a call. A process of one's own making has the seeds that follow
             `seed`: give each another one.
         loss: of an image [height, width, channels] tensor, or of [views, height, width, channels], a scalar: the black
-            box then returns losses.
+            box then returns losses. It is not differentiated, so NumPy and scikit-image will do.
         nan: "raise" refuses pixels that are not finite; "keep" leaves them to what receives them, see `on_nonfinite`
             of `BlackBox`.
         variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of one.
@@ -204,13 +205,8 @@ class MitsubaScene:
             out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32, device="cpu")
         else:
             with torch.no_grad():
-                losses = [self.loss(image) for image in images]
-            for one in losses:
-                if not isinstance(one, Tensor) or one.numel() != 1:
-                    got = f"shape {list(one.shape)}" if isinstance(one, Tensor) else f"{one!r}"
-                    raise ValueError(f"loss must return a tensor with one number per image, got {got}")
-            out = torch.stack([one.reshape(()) for one in losses]) if losses else torch.empty(0, device="cpu")
-            out = out.to(x.dtype)
+                losses = [_number(self.loss(image)) for image in images]
+            out = (torch.stack(losses) if losses else torch.empty(0, device="cpu")).to(x.dtype)
         return out.to(x.device)
 
     def set(self, x: Tensor) -> None:
@@ -269,6 +265,17 @@ class MitsubaScene:
                 f'at row {wrong[0][0]}, column {wrong[0][1]}; nan="keep" leaves them to on_nonfinite of BlackBox'
             )
         return torch.from_numpy(image)
+
+
+def _number(loss: Any) -> Tensor:
+    """Return what a loss has returned as a tensor without dimensions."""
+    try:
+        found = as_tensor(loss)
+    except TypeError as error:
+        raise TypeError(f"loss must return one number per image, got {loss!r}") from error
+    if found.numel() != 1:
+        raise ValueError(f"loss must return one number per image, got shape {list(found.shape)}")
+    return found.reshape(())
 
 
 def _check(

@@ -48,8 +48,8 @@ class Program(Closing):
 
     A run fails if it ends with a code other than 0, takes too long, or writes no number, or fewer or more of them than
     before. With on_failure="nan" all points of the run have NaN as their values, in the shape of earlier outputs.
-    Before the first output the shape is not known, and each point gets one NaN: if outputs are tensors, call the
-    program at a point where it works first. `on_nonfinite` of a layer says how it treats a NaN; `minimize` avoids the
+    Before the first output the shape is not known, and each point gets a single NaN. Searches, layers and evaluators
+    take it for an output without any number. `on_nonfinite` of a layer says how it treats a NaN; `minimize` avoids the
     point.
 
     A `Program` can be pickled; a copy starts a program of its own. So does a process made by a fork, as the workers of

@@ -18,6 +18,7 @@ from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.inline import Inline
 from torch_zerohess.evaluators.payload import RemoteTraceback
+from torch_zerohess.evaluators.single_nan import filled
 from torch_zerohess.evaluators.values import checked_values
 
 ValueMode = Literal["center", "smoothed"]
@@ -45,6 +46,8 @@ class BlackBoxCall:
     """The function outside of the expectation of the values."""
     answered: bool = field(default=False, init=False, repr=False, compare=False)
     """Whether a call has given values."""
+    latest: Tensor | None = field(default=None, init=False, repr=False, compare=False)
+    """The latest outputs, without points: [0, *out]. None as long as no call has given outputs of several numbers."""
 
     def __post_init__(self) -> None:
         if not callable(self.fn):
@@ -75,6 +78,10 @@ class BlackBoxCall:
                 add_advice(error, self.fn, points, aux, vectorized=self.vectorized, headed=headed)
             raise
         values = checked_values(result, points, self.vectorized)
+        if values.ndim > 1:
+            object.__setattr__(self, "latest", values[:0].clone())
+        elif self.latest is not None:
+            values = filled(values, self.latest)
         object.__setattr__(self, "answered", True)
         # A copy: the black box may go on writing to what it returned.
         return _copied(values) if values.device == points.device else values.to(points.device).contiguous()

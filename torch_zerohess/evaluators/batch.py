@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.single_nan import alike, filled
 from torch_zerohess.evaluators.transfer import Part, joined
 
 MOST = 256
@@ -153,14 +154,18 @@ class Batch:
             if known is None:
                 raise self.loss()
             return torch.full((len(self.points), *known[1]), torch.nan, dtype=known[0], device="cpu")
-        first = parts[0][1]
-        for start, values in parts:
-            if values.shape[1:] != first.shape[1:]:
+        found = [values for _, values in parts]
+        if len({one.shape[1:] for one in found}) > 1:
+            found = [Part.of(one) for one in alike([one.tensor() for one in found])]
+        for start, values in zip((start for start, _ in parts), found, strict=True):
+            if values.shape[1:] != found[0].shape[1:]:
                 raise ValueError(
-                    f"fn must return values of one shape, got {list(first.shape[1:])} for point {parts[0][0]} and "
+                    f"fn must return values of one shape, got {list(found[0].shape[1:])} for point {parts[0][0]} and "
                     f"{list(values.shape[1:])} for point {start}, [{numbers(self.points[start])}]"
                 )
-        some = joined([values for _, values in parts])
+        some = joined(found)
+        if known is not None:
+            some = filled(some, torch.empty(0, *known[1], dtype=known[0], device="cpu"))
         if not self.lost:
             return some
         rows = torch.tensor([k for k in range(len(self.points)) if k not in self.lost], device="cpu")

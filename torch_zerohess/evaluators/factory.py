@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.partial_values import keep_finished
+from torch_zerohess.evaluators.single_nan import alike, without_output
 from torch_zerohess.evaluators.values import as_tensor
 
 
@@ -79,19 +80,22 @@ class Each:
 
     def __call__(self, points: Tensor, *aux: Tensor) -> Tensor:
         values: list[Tensor] = []
+        shape: torch.Size | None = None
         try:
             for one in zip(points, *aux, strict=True):
                 value = as_tensor(self.fn(*one))
-                if values and value.shape != values[0].shape:
-                    raise ValueError(
-                        f"fn must return the same shape for every point, got {list(value.shape)} at the point "
-                        f"[{numbers(one[0])}] and {list(values[0].shape)} before"
-                    )
+                if not without_output(value[None]):
+                    if shape is not None and value.shape != shape:
+                        raise ValueError(
+                            f"fn must return the same shape for every point, got {list(value.shape)} at the point "
+                            f"[{numbers(one[0])}] and {list(shape)} before"
+                        )
+                    shape = value.shape
                 values.append(value.clone())  # fn may go on writing to what it returned
         except BaseException as error:  # Ctrl-C, too
             keep_finished(error, points, dict(enumerate(values)))
             raise
-        return torch.stack(values)
+        return torch.cat(alike([one[None] for one in values]))
 
 
 def same(first: Callable[..., Any] | None, second: Callable[..., Any]) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.single_nan import alike
 from torch_zerohess.evaluators.values import checked_values
 
 
@@ -34,7 +35,7 @@ def finished_values(error: BaseException, points: Tensor) -> tuple[list[int], Te
     if isinstance(found, Finished) and found.points is points and found.values:
         numbers = sorted(found.values)
         try:
-            values = torch.stack([found.values[k] for k in numbers])
+            values = torch.cat(alike([found.values[k][None] for k in numbers]))
             return numbers, checked_values(values, points[numbers]).to(points.device, copy=True)
         except (TypeError, ValueError, RuntimeError):  # of different shapes, or no numbers: they are of no use
             pass

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.returned import ReturnedTypeError, ReturnedValueError
+from torch_zerohess.evaluators.single_nan import filled_rows
 
 _SHOWN = 8
 """Keys of a dictionary that a message names."""
@@ -21,6 +22,7 @@ def stacked(rows: Any) -> Any:
     """
     if not isinstance(rows, (list, tuple)):
         return rows
+    rows = filled_rows(rows)
     kind = type(leaf(rows))
     numpy: Any = sys.modules.get("numpy")
     arrays = numpy is not None and issubclass(kind, numpy.ndarray)
@@ -63,9 +65,9 @@ def leaf(result: Any) -> Any:
 def as_tensor(result: Any) -> Tensor:
     """Return what a black box returned as a tensor of real or complex numbers.
 
-    A list of tensors or arrays of one shape is stacked. Numbers of Python are float64, alone and in lists, and so are
-    integers and truth values of any kind: counts, images of bytes, a loss that is 0 on a plateau. Masked entries of a
-    NumPy array are NaN. Sparse tensors are filled.
+    A list of tensors or arrays of one shape is stacked; a single NaN in it stands for a whole one. Numbers of Python
+    are float64, alone and in lists, and so are integers and truth values of any kind: counts, images of
+    bytes, a loss that is 0 on a plateau. Masked entries of a NumPy array are NaN. Sparse tensors are filled.
     """
     if isinstance(result, Mapping):
         names = ", ".join(map(repr, itertools.islice(result, _SHOWN))) + (", ..." if len(result) > _SHOWN else "")

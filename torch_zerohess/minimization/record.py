@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
+from torch_zerohess.evaluators.single_nan import alike
 from torch_zerohess.minimization.minimality_checks import DEEP, is_unbounded
 
 _HELD = 1 << 22
@@ -88,11 +89,12 @@ class Record:
         if missing:
             numbers, values, error = self._call(points[missing])
             if numbers:
+                values = alike([*(one for one in self._outputs[-1:] if len(one)), values])[-1]
                 self._first = values[0].clone() if self._first is None else self._first
                 self._same = (
                     self._same and values.shape[1:] == self._first.shape and bool((values == self._first).all())
                 )
-                self._values = torch.cat([self._values, values]) if self._numbers else values
+                self._values = torch.cat(alike([self._values, values])) if self._numbers else values
                 self._numbers += [missing[k] for k in numbers]
             if error is not None:
                 raise error

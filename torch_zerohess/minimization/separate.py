@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.returned import ReturnedValueError
+from torch_zerohess.evaluators.single_nan import alike
 from torch_zerohess.minimization.record import Call
 
 
@@ -25,12 +26,13 @@ def separated(call: Call, alone: Callable[[int], bool]) -> Call:
         numbers, values, first = list[int](), list[Tensor](), 0
         for part in points.split(lengths(points)):
             found, returned, error = call(part)
-            if found and values and returned.shape[1:] != values[0].shape[1:]:
-                shapes = f"{list(values[0].shape[1:])} and {list(returned.shape[1:])}"
+            *known, returned = alike([*values, returned])
+            if found and known and returned.shape[1:] != known[0].shape[1:]:
+                shapes = f"{list(known[0].shape[1:])} and {list(returned.shape[1:])}"
                 found, error = [], ReturnedValueError(f"fn must return values of one shape in every call, got {shapes}")
             if found:
                 numbers += [first + k for k in found]
-                values.append(returned)
+                values = [*known, returned]
             if error is not None:
                 return numbers, torch.cat(values) if values else returned, error
             first += len(part)

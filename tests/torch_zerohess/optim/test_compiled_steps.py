@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from torch_zerohess.linalg.jacobians import Rows
+from torch_zerohess.optim.outside import check_inside
 
 STEPS = {
     "NewtonCG": lambda params: zh.optim.NewtonCG(params, radius=0.3),
@@ -51,3 +53,15 @@ def test_a_compiled_step_to_targets() -> None:
         return step
 
     assert losses(True, train) == losses(False, train)
+
+
+def test_a_compiled_network_whose_second_backward_pass_is_wrong_is_named() -> None:
+    """With dynamic shapes torch 2.15 gets other gradients from the second pass; a Jacobian of zeros stands for them."""
+    torch.compiler.reset()
+    network = torch.nn.Linear(4, 3)
+    layer = zh.BlackBox(lambda z: z.square().sum(1), zh.Smoothing(sigma=0.4, samples=8))
+    loss = layer(torch.compile(network, backend="aot_eager")(torch.randn(6, 4))).mean()
+    operator = zh.CurvatureOperator(loss, network.parameters(), mode="gauss_newton")
+    wrong = Rows(torch.zeros(18, 15))
+    with pytest.raises(RuntimeError, match=r"outside of torch\.compile, got one with a compiled backward"):
+        check_inside(wrong, [operator], operator.gradient.double(), sampled=False)

@@ -161,14 +161,16 @@ class AskTell(Standing[P]):
             values = torch.stack([early[k] for k in range(len(points))])
         self._take(values, points)
 
-    def tell_at(self, values: Any, points: Tensor) -> None:
-        """Take values of points of the caller's own [K, n], in the type of x0, the start first; before any `tell`.
+    def tell_at(self, values: Any, points: Any) -> None:
+        """Take values of points [K, n] that the caller has evaluated already, the start first; before any `tell`.
 
-        Otherwise as `tell`. RuntimeError if values have been told.
+        The search begins with a model of them, and takes fewer evaluations. Points are a tensor, an array or a list.
+        Otherwise as `tell`. RuntimeError if values have been told; ValueError for points that are not finite, or not
+        within the bounds.
         """
         if self.evaluations or self._early:
             raise RuntimeError("values have been told: points of one's own come before")
-        self._take(converted(values, self.unit.device), self._space.coordinates(points))
+        self._take(converted(values, self.unit.device), self._space.coordinates(self._space.checked_points(points)))
 
     def _take(self, values: Tensor, points: Tensor) -> None:
         """Take a step with the values [K, *out] of points [K, n], in units of sigma."""

@@ -69,6 +69,21 @@ class Space:
                     f"state must be of a search with {name} bounds {own.tolist()}, got {state[name].tolist()}"
                 )
 
+    def checked_points(self, points: Any) -> Tensor:
+        """Return points [K, n] of the caller's as a tensor. ValueError if a search could not have asked for them."""
+        n = len(self.start)
+        try:
+            points = torch.as_tensor(points, device=self.unit.device).double()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"points must be numbers [K, {n}], got {reprlib.repr(points)}") from error
+        if points.ndim != 2 or points.shape[1] != n or not len(points):
+            raise ValueError(f"points must have shape [K, {n}], the start first, got {list(points.shape)}")
+        wrong = ~((points >= self.lower) & (points <= self.upper) & torch.isfinite(points)).all(1)
+        if bool(wrong.any()):
+            k = int(wrong.nonzero()[0])
+            raise ValueError(f"points must be finite and within the bounds, got {points[k].tolist()} as number {k}")
+        return points.detach()
+
     def coordinates(self, x: Tensor) -> Tensor:
         """Coordinates of parameters x, float64."""
         return x.double() / self.unit

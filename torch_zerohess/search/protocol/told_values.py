@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.estimation.inputs import times_changed
 from torch_zerohess.evaluators.returned import ReturnedTypeError, ReturnedValueError
+from torch_zerohess.evaluators.single_nan import alike, filled, without_output
 from torch_zerohess.evaluators.values import as_tensor
 from torch_zerohess.search.protocol.state import Evaluated
 
@@ -53,8 +54,11 @@ def as_evaluated(
         raise ReturnedValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
     if loss is None:
         return Evaluated(points, values)
+    values = filled(values, values.new_empty(0, *shape))
     if shape and values.shape[1:] != shape:
         raise ReturnedValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
+    if without_output(values):  # a loss need not take a single NaN in place of an output
+        return Evaluated(points, values, values[:, None], values.shape[1:])
     before = times_changed(values)
     with torch.no_grad():
         losses = [loss(one) for one in values]
@@ -75,7 +79,7 @@ def _check_loss(loss: Any, shape: list[int]) -> None:
     if not isinstance(loss, Tensor):
         raise ReturnedTypeError(
             f"loss must return a tensor, which torch differentiates, got {type(loss).__name__} for one output of shape "
-            f"{shape}"
+            f"{shape}: a loss that torch cannot compute belongs into the black box, which then returns the loss"
         )
     if loss.numel() != 1:
         raise ReturnedValueError(
@@ -102,12 +106,13 @@ def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count
         raise ReturnedValueError(
             f"values must have one per point in which, [{len(numbers)}, *out], got {list(values.shape)}"
         )
-    for other in early.values():
-        if other.shape != values.shape[1:]:
+    found = alike([*(value[None] for value in early.values()), values])
+    for other in found:
+        if other.shape[1:] != found[-1].shape[1:]:
             raise ReturnedValueError(
-                f"values must have outputs {list(other.shape)} as before, got {list(values.shape[1:])}"
+                f"values must have outputs {list(other.shape[1:])} as before, got {list(values.shape[1:])}"
             )
-    return early | {one: value.clone() for one, value in zip(numbers, values, strict=True)}
+    return dict(zip([*early, *numbers], (one.clone() for part in found for one in part), strict=True))
 
 
 def moderate(told: Evaluated) -> Evaluated:

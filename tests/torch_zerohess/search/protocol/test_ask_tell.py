@@ -390,6 +390,34 @@ def test_points_of_ones_own_come_first():
         search.tell_at([0.0] * 5, points)
 
 
+@pytest.mark.parametrize("kind", [torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.clone])
+def test_a_search_goes_on_from_evaluations_of_the_caller(kind):
+    """The minimum of a quadratic follows from n (n + 1) / 2 + n + 1 = 6 values."""
+    search = Descent(zeros(2), sigma=0.5, bounds=(-2, 2), seed=0)
+    points = vector(0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, -1.0, 1.0, 1.0).view(6, 2)
+    search.tell_at(kind((points - 0.25).square().sum(1)), kind(points))
+    x = search.ask()
+    search.tell((x - 0.25).square().sum(1))
+    assert search.value < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ([[0.0, 0.0], [0.0, 2.5]], r"within the bounds, got \[0.0, 2.5\] as number 1"),
+        ([[0.0, 0.0], [0.0, math.nan]], r"finite and within the bounds, got \[0.0, nan\] as number 1"),
+        ([0.0, 0.0], r"points must have shape \[K, 2\], the start first, got \[2\]"),
+        ([[0.0], [1.0]], r"points must have shape \[K, 2\], the start first, got \[2, 1\]"),
+        ("zero", r"points must be numbers \[K, 2\], got 'zero'"),
+    ],
+)
+def test_points_of_the_caller_that_a_search_could_not_ask_for(points, message):
+    search = Descent(zeros(2), sigma=0.5, bounds=(-2, 2), seed=0)
+    with pytest.raises(ValueError, match=message):
+        search.tell_at([0.0, 1.0], points)
+    assert search.evaluations == 0
+
+
 def test_values_before_points():
     search = Descent(zeros(3), sigma=1.0, seed=0)
     with pytest.raises(RuntimeError, match="ask for points"):

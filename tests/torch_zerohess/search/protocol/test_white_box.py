@@ -32,7 +32,11 @@ RAISED = {
 RETURNED = {
     "losses of rows": (lambda y: y.square().flatten(1).mean(1), ValueError, r"a scalar, got shape \[4\]"),
     "nothing": (lambda y: y[:0], ValueError, r"a scalar, got shape \[0, 4\]"),
-    "a float": (lambda y: float(y.sum()), TypeError, "a tensor, which torch differentiates, got float"),
+    "a float": (
+        lambda y: float(y.sum()),
+        TypeError,
+        "a tensor, which torch differentiates, got float",
+    ),
     "an array": (lambda y: np.square(y.numpy()).sum(), TypeError, "a tensor, which torch differentiates, got float64"),
 }
 
@@ -84,3 +88,9 @@ def test_errors_of_a_loss_that_has_returned_values_are_the_callers_own(graph) ->
 
     with pytest.raises(OwnError, match=r"^$"):
         zh.minimize(image, [0.7, 0.2], sigma=0.3, loss=other, seed=0)
+
+
+def test_where_a_loss_belongs_that_torch_cannot_compute() -> None:
+    search = zh.optim.TrustRegion([0.7, 0.2], sigma=0.3, loss=lambda y: float(y.sum()), seed=0)
+    with pytest.raises(TypeError, match="that torch cannot compute belongs into the black box"):
+        search.tell(image(search.ask()))

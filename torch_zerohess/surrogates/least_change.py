@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.loss_transform import LossTransform, transformed
 from torch_zerohess.surrogates.quadratic import coefficient_count
 
 _EXACT = 1e-10
@@ -55,53 +56,106 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
     result is a regression. Near points count more than far ones, and much more where the points are few or where the
     likelihood of the values says so.
     """
-    n = u.shape[1]
-    curved = ((u @ hessian) * u).sum(1)
-    rest = values - 0.5 * curved
-    scale = (_SCALED * n) ** 0.5 / (float(hessian.norm()) or 1.0) if n > _TOLD else 0.0
-    bend = scale * curved
-    if len(u) < _FEW * coefficient_count(n):
-        fit = _Affine.through(u, values, rest, bend, _OF_FEW)
-    else:
-        smooth, rough = (_Affine.through(u, values, rest, bend, rate) for rate in (_CUBIC, _ROUGH))
-        fit = rough if rough.likelihood > smooth.likelihood + math.log(_LIKELIER) else smooth
-    alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
-    change = (u.mT * alpha) @ u + 0.5 * float(alpha @ bend) * scale * hessian
-    change.diagonal().add_(0.5 * _ALIKE * float(alpha @ u.square().sum(1)))
-    return float(fit.coefficients[0]), fit.coefficients[1:], hessian + 0.5 * (change + change.mT)
+    deviations, _ = _likeliest(u, values[:, None], values.new_zeros(1), hessian)
+    return deviations.quadratic(values, hessian)
+
+
+def least_change_of_transform(
+    u: Tensor, values: Tensor, hessian: Tensor, earlier: LossTransform | None
+) -> tuple[LossTransform, Tensor, Tensor]:
+    """Return the likeliest transform of losses, and gradient [n] and Hessian [n, n] at u = 0 of the transformed losses.
+
+    Args:
+        u: points [P, n], of the order of 1; the best one is 0.
+        values: losses [P] above the lowest one, the largest of the order of 1.
+        hessian: the earlier one [n, n].
+        earlier: transform of the losses whose Hessian this is; None if it is of the losses themselves.
+    """
+    transforms, columns, slopes = transformed(values)
+    deviations, k = _likeliest(u, columns, slopes, hessian)
+    if earlier is not None:
+        hessian = transforms[k].hessian_ratio(earlier) * hessian
+    _, gradient, hessian = deviations.quadratic(columns[:, k], hessian)
+    return transforms[k], gradient, hessian
+
+
+def _likeliest(u: Tensor, columns: Tensor, slopes: Tensor, hessian: Tensor) -> tuple["_Deviations", int]:
+    """Return the likeliest process of deviations, and for which column of values [P, T] it is.
+
+    slopes: the mean logarithms [T] of dy/dv, where the columns y are functions of values v.
+    """
+    P, n = u.shape
+    bend = _curved(u, _multiple(hessian))
+    few = len(u) < _FEW * coefficient_count(n)
+    rates = {_OF_FEW: 0.0} if few else {_CUBIC: 0.0, _ROUGH: -math.log(_LIKELIER)}
+    processes = [_Deviations.of(u, bend, rate) for rate in rates]
+    degrees = max(P - n - 1, 1)  # the slopes count as often as values do that the affine function leaves free
+    likelihoods = torch.stack([one.likelihood(columns) + degrees * slopes for one in processes])
+    likelihoods += likelihoods.new_tensor(list(rates.values()))[:, None]
+    process, column = divmod(int(likelihoods.argmax()), columns.shape[1])
+    return processes[process], column
+
+
+def _multiple(hessian: Tensor) -> Tensor:
+    """Return the multiple [n, n] of the earlier Hessian whose factor is a normal number of variance 1."""
+    n = len(hessian)
+    return ((_SCALED * n) ** 0.5 / (float(hessian.norm()) or 1.0) if n > _TOLD else 0.0) * hessian
+
+
+def _curved(u: Tensor, hessian: Tensor) -> Tensor:
+    """Return u.H u [P]."""
+    return ((u @ hessian) * u).sum(1)
 
 
 @dataclass(frozen=True)
-class _Affine:
-    """An affine function fitted to values. Their deviations from it are a Gaussian process."""
+class _Deviations:
+    """The Gaussian process of the deviations of values from an affine function."""
 
+    u: Tensor
+    """Points [P, n]."""
     factor: Tensor
     """Cholesky factor of the covariance of the deviations [P, P]."""
-    coefficients: Tensor
-    """[n + 1]"""
-    left: Tensor
-    """Deviations of the values less the earlier Hessian, divided by the factor [P]."""
-    likelihood: float
-    """Logarithm of the restricted likelihood of the values, not of the `rest`, at the likeliest scale."""
+    design: Tensor
+    """Affine functions at the points, divided by the factor [P, n + 1]."""
+    q: Tensor
+    """Of the QR decomposition of the design and of the prior, the rows of the points [P, n + 1]."""
+    r: Tensor
+    """[n + 1, n + 1]"""
 
     @classmethod
-    def through(cls, u: Tensor, values: Tensor, rest: Tensor, bend: Tensor, cubic: float) -> "_Affine":
-        """Fit values [P] at u [P, n], for the likelihood, and the `rest` of them less the earlier Hessian [P].
-
-        bend: u.H u [P] of the Hessian H whose multiple the change has.
-        """
+    def of(cls, u: Tensor, bend: Tensor, cubic: float) -> "_Deviations":
+        """Return the process at points [P, n]; bend [P] is u.H u of the Hessian whose multiple the change has."""
         P, n = u.shape
         factor = _factor(u, cubic, _ALIKE, bend)
-        columns = torch.cat([u.new_ones(P, 1), u, rest[:, None], values[:, None]], 1)
-        design, targets = torch.linalg.solve_triangular(factor, columns, upper=False).split([n + 1, 2], 1)
+        design = torch.linalg.solve_triangular(factor, torch.cat([u.new_ones(P, 1), u], 1), upper=False)
         free = (_FREE * float(design.square().sum(0).amax())) ** 0.5
         q, r = torch.linalg.qr(torch.cat([design, free * torch.eye(n + 1, dtype=u.dtype, device=u.device)]))
-        found = torch.linalg.solve_triangular(r, q[:P].mT @ targets, upper=True)
-        left, own = (targets - design @ found).unbind(1)
-        degrees = max(P - n - 1, 1)
-        variance = max(float(own.square().sum()) / degrees, torch.finfo(u.dtype).tiny)
-        volume = float(factor.diagonal().log().sum() + r.diagonal().abs().log().sum())
-        return cls(factor, found[:, 0], left, -0.5 * degrees * math.log(variance) - volume)
+        return cls(u, factor, design, q[:P], r)
+
+    def affine(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Return coefficients [n + 1, T] of columns of values [P, T], and the rest divided by the factor [P, T]."""
+        targets = torch.linalg.solve_triangular(self.factor, columns, upper=False)
+        found = torch.linalg.solve_triangular(self.r, self.q.mT @ targets, upper=True)
+        return found, targets - self.design @ found
+
+    def likelihood(self, columns: Tensor) -> Tensor:
+        """Return logarithms [T] of the restricted likelihood of columns of values [P, T], at their likeliest scales.
+
+        They are not of the values less the earlier Hessian: this Hessian may be wrong.
+        """
+        degrees = max(len(self.u) - len(self.r), 1)
+        variances = (self.affine(columns)[1].square().sum(0) / degrees).clamp(min=torch.finfo(columns.dtype).tiny)
+        volume = self.factor.diagonal().log().sum() + self.r.diagonal().abs().log().sum()
+        return -0.5 * degrees * variances.log() - volume
+
+    def quadratic(self, values: Tensor, hessian: Tensor) -> tuple[float, Tensor, Tensor]:
+        """Return value, gradient and Hessian of the quadratic of values [P], given the earlier Hessian [n, n]."""
+        u, multiple = self.u, _multiple(hessian)
+        coefficients, left = self.affine((values - 0.5 * _curved(u, hessian))[:, None])
+        alpha = torch.linalg.solve_triangular(self.factor.mT, left, upper=True)[:, 0]
+        change = (u.mT * alpha) @ u + 0.5 * float(alpha @ _curved(u, multiple)) * multiple
+        change.diagonal().add_(0.5 * _ALIKE * float(alpha @ u.square().sum(1)))
+        return float(coefficients[0]), coefficients[1:, 0], hessian + 0.5 * (change + change.mT)
 
 
 @dataclass(frozen=True)

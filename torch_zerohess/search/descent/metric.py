@@ -247,19 +247,28 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     # Models.
 
     def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
-        u, n = known.scaled, self._n
-        chosen = self._nearest(known, 2 * n + 1)
+        u, values, size = self._fitted_to(known)
+        earlier = self._earlier(known, known.hessian, known.size / size, u, values)
+        _, gradient, hessian = least_change(u, values, earlier)
+        gradient, hessian = of_step(known, gradient, hessian)
+        return replace(known, size=size, gradient=gradient, hessian=hessian), len(u)
+
+    def _fitted_to(self, known: MetricProgress) -> tuple[Tensor, Tensor, float]:
+        """Return the nearest points u [P, n], their losses [P] above the lowest one over their size, and this size."""
+        chosen = self._nearest(known, 2 * self._n + 1)
         values = known.values[chosen] - known.lowest.loss
         size = float(values.abs().max()) or 1.0
-        axes, ratio = known.sigma * known.root, known.size / size
-        before = axes.mT @ (ratio * known.hessian) @ axes if ratio < _ROUNDED else torch.zeros_like(known.hessian)
-        if len(known.values) <= 2 * n:
-            before = fit_values(u[chosen], values / size, torch.ones_like(values)).full_hessian()
-        _, gradient, hessian = least_change(u[chosen], values / size, before)
-        back = torch.linalg.inv(axes)
-        hessian = back.mT @ hessian @ back
-        hessian = 0.5 * (hessian + hessian.mT)
-        return replace(known, size=size, gradient=back.mT @ gradient, hessian=hessian), len(chosen)
+        return known.scaled[chosen], values / size, size
+
+    def _earlier(self, known: MetricProgress, hessian: Tensor, ratio: float, u: Tensor, values: Tensor) -> Tensor:
+        """Return an earlier Hessian [n, n] in the units of u and of values [P]; of the first values it is their own.
+
+        ratio: of the units of the Hessian and of the values.
+        """
+        if len(known.values) <= 2 * self._n:
+            return fit_values(u, values, torch.ones_like(values)).full_hessian()
+        axes = known.sigma * known.root
+        return axes.mT @ (ratio * hessian) @ axes if ratio < _ROUNDED else torch.zeros_like(hessian)
 
     def _learned(self, known: MetricProgress, count: int) -> Tensor:
         rate = self._rate(count) * min(1.0, len(known.values) / self._coefficients) ** _EARLY
@@ -268,3 +277,10 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _rate(self, count: int) -> float:
         """Return the rate at which the metric is learned from a quadratic of so many points."""
         return _RATE * min(1.0, count / self._coefficients) ** _FALLING
+
+
+def of_step(known: MetricProgress, gradient: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
+    """Return gradient [n] and Hessian [n, n] by a step s, given those by u."""
+    back = torch.linalg.inv(known.sigma * known.root)
+    hessian = back.mT @ hessian @ back
+    return back.mT @ gradient, 0.5 * (hessian + hessian.mT)

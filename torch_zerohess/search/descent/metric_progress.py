@@ -10,6 +10,7 @@ from torch_zerohess.search.descent.axis_search import AxisLines
 from torch_zerohess.search.descent.progress import DescentProgress
 from torch_zerohess.search.protocol.state import Best
 from torch_zerohess.search.region.progress import RegionProgress
+from torch_zerohess.surrogates.loss_transform import LossTransform
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,24 @@ class TwoSides:
         return self.matrices[1, 1:, 0] - self.matrices[0, 1:, 0]
 
 
+@dataclass(frozen=True, eq=False)
+class TransformedQuadratic:
+    """A quadratic of transformed losses (`LossTransform`), of steps s from the best point."""
+
+    transform: LossTransform
+    """Its shift is in units of `size`."""
+    size: float
+    """The losses over this number are transformed."""
+    gradient: Tensor
+    """[n]"""
+    hessian: Tensor
+    """[n, n]"""
+
+    def change(self, s: Tensor) -> float:
+        """Return the change of the loss by a step [n]."""
+        return self.size * self.transform.inverse(float(self.gradient @ s + 0.5 * (s @ self.hessian @ s)))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MetricProgress(RegionProgress):
     """The progress of a descent in a learned metric."""
@@ -52,6 +71,10 @@ class MetricProgress(RegionProgress):
     """Loss of this round above `bottom`, where it was last predicted."""
     times: int = 0
     """Predictions in a row that were right."""
+    transformed: TransformedQuadratic | None = None
+    """The last quadratic of transformed losses, see `TransformedQuadratics`."""
+    transformable: float = 0.0
+    """How much better it has predicted the latest losses than the quadratic of the losses themselves."""
     sides: TwoSides | None = None
     """Two quadratics beside a kink, see `TwoSidedQuadratics`; None where one is enough."""
     evidence: float = 0.0

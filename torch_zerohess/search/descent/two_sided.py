@@ -8,28 +8,25 @@ The metric of the region is learned from the Hessian of the quadratics mixed as 
 along the kink.
 """
 
-import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.larger_of_two import least_of_larger, share_of_shortest
 from torch_zerohess.linalg.metric import learned, region_step
-from torch_zerohess.search.descent.metric import CURVED, MetricQuadratics
+from torch_zerohess.search.descent.evidence import weighed
+from torch_zerohess.search.descent.metric import CURVED
 from torch_zerohess.search.descent.metric_progress import MetricProgress, TwoSides
+from torch_zerohess.search.descent.transformed import TransformedQuadratics
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.surrogates.two_sides import fit_two_sides
 
 _MOST = 10
 """Parameters up to which two quadratics are fitted."""
-_FADING, _LARGEST = 0.8, 2.0
-"""The evidence is a sum over evaluations of log(error of one quadratic / error of two). Each term is at most the second
-number in magnitude. Each new term multiplies the sum so far by the first number."""
 _ENOUGH = 2.0
 """Evidence from which steps follow two quadratics."""
-_ROUNDING, _SMALLEST = 1e-14, 1e-300
-"""Error of a prediction that is rounding, relative to the loss, and at a loss of 0."""
 _FEWEST = 2
 """Evaluations, beyond the coefficients of one quadratic, that two are fitted to at least."""
 _FAR, _RELATIVELY = 8.0, 2.0
@@ -39,7 +36,7 @@ _SHARP = 3.0
 quadratics of a smooth loss differ by less."""
 
 
-class TwoSidedQuadratics(MetricQuadratics):
+class TwoSidedQuadratics(TransformedQuadratics):
     """Descent on quadratics of a loss alone, and on the larger of two beside a kink."""
 
     def next(
@@ -49,17 +46,10 @@ class TwoSidedQuadratics(MetricQuadratics):
 
     def _weighed(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the loss at the point that was needed with what one quadratic and two have predicted."""
-        if known.sides is None or known.wide is not None or known.phase not in ("trial", "geometry"):
+        if known.sides is None:
             return known
-        if not bool(evaluated.finite[0]):
-            return known
-        s, change = evaluated.points[0] - known.lowest.point, float(evaluated.losses[0]) - known.lowest.loss
-        rounding = _ROUNDING * abs(known.lowest.loss) + _SMALLEST
-        errors = [
-            abs(change - predicted) + rounding for predicted in (super()._change(known, s), known.sides.change(s))
-        ]
-        gain = math.log(errors[0]) - math.log(errors[1])
-        return replace(known, evidence=_FADING * known.evidence + min(max(gain, -_LARGEST), _LARGEST))
+        one = partial(super()._change, known)
+        return replace(known, evidence=weighed(known.evidence, known, evaluated, one, known.sides.change))
 
     def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
         known, count = super()._modelled(replace(known, sides=None))

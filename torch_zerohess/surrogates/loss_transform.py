@@ -1,0 +1,58 @@
+"""Transforms of a loss that may bring it closer to a quadratic: squares and logarithms (Box and Cox 1964).
+
+The root of a mean square is a cone at its minimum, but its square is a quadratic. Sums of exponentials or of fourth
+powers grow so steeply that their logarithm is closer to a quadratic.
+
+Losses v >= 0 above the lowest one become ((v + c)^2 - c^2) / (2 c) or c log(1 + v / c), with a shift c > 0. Both are
+about v where v is far below c, and both rise with v: the minimum stays where it is. The shift and the kind are chosen
+by the likelihood of the values. It has one factor for every value, the slope of the transform there.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+_SHIFTS = tuple(20.0 * 1.5**-k for k in range(30))
+"""Shifts to choose from, over the largest value."""
+_HIGHEST = 50.0
+"""Logarithm of the largest loss over the shift that is predicted."""
+
+
+@dataclass(frozen=True)
+class LossTransform:
+    """A transform of losses above the lowest one."""
+
+    kind: Literal["square", "logarithm"]
+    shift: float
+    """In units of the losses; above 0."""
+
+    def inverse(self, y: float) -> float:
+        """Return the loss above the lowest one; minus the shift where a quadratic predicts less than any square."""
+        if self.kind == "logarithm":
+            return self.shift * math.expm1(min(y / self.shift, _HIGHEST))
+        return math.sqrt(max(self.shift * (self.shift + 2.0 * y), 0.0)) - self.shift
+
+    def hessian_ratio(self, other: "LossTransform") -> float:
+        """Return the Hessian on this scale over the Hessian on the other one. Only squares of one kind are told."""
+        return other.shift / self.shift if self.kind == other.kind == "square" else 1.0
+
+
+def transformed(values: Tensor) -> tuple[list[LossTransform], Tensor, Tensor]:
+    """Return the transforms to choose from, the values on their scales, and the mean log slope of each.
+
+    Args:
+        values: losses [P] above the lowest one, the largest of the order of 1.
+
+    Returns:
+        Transforms, values [P, T] and means [T].
+    """
+    shifts = torch.tensor(_SHIFTS, dtype=values.dtype, device=values.device)
+    v = values[:, None]
+    squares, logarithms = v + v.square() / (2.0 * shifts), shifts * (v / shifts).log1p()
+    slopes = (v / shifts).log1p().mean(0)
+    kinds: tuple[Literal["square", "logarithm"], ...] = ("square", "logarithm")
+    transforms = [LossTransform(kind, shift) for kind in kinds for shift in _SHIFTS]
+    return transforms, torch.cat([squares, logarithms], 1), torch.cat([slopes, -slopes])

@@ -143,11 +143,7 @@ def grid_evidence(
     """
     P, m = change.shape
     lengths, levels = points.new_tensor(LENGTHS), points.new_tensor(noises)
-    every = []
-    for structure in structures:
-        separation = separations(structure, points, points)
-        every += [covariances(structure, kernel, separation / length) for kernel in KERNELS for length in LENGTHS]
-    values, vectors = torch.linalg.eigh(torch.stack(every) + CONSTANT)
+    values, vectors = _spectra(points, structures)
     power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
     spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [structures x kernels x lengths, N, P]
     squares, logs, count = (power[:, None] / spectrum).sum(2) / m, spectrum.log().sum(2), P
@@ -161,6 +157,27 @@ def grid_evidence(
     evidence = -count * variances.log() - logs
     evidence -= improbability(lengths).repeat(len(structures) * len(KERNELS))[:, None]
     return evidence, variances
+
+
+def transformed_evidence(points: Tensor, columns: Tensor, structures: Sequence[Structure] = ("joint",)) -> Tensor:
+    """Highest log evidence [T], as in `grid_evidence`, for each column of values [P, T] at points [P, n] alone."""
+    P, lengths, levels = len(points), points.new_tensor(LENGTHS), points.new_tensor(NOISES)
+    values, vectors = _spectra(points, structures)
+    power = (vectors.mT @ (columns - columns.mean(0))).square()  # [structures x kernels x lengths, P, T]
+    spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [structures x kernels x lengths, N, P]
+    variances = spectrum.reciprocal() @ power / P + math.ulp(0.0)
+    prior = improbability(lengths).repeat(len(structures) * len(KERNELS))[:, None, None]
+    return (-P * variances.log() - spectrum.log().sum(2)[..., None] - prior).flatten(0, 1).amax(0)
+
+
+def _spectra(points: Tensor, structures: Sequence[Structure]) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and vectors of the covariances of points [P, n], for every structure, kernel and length."""
+    every = []
+    for structure in structures:
+        separation = separations(structure, points, points)
+        every += [covariances(structure, kernel, separation / length) for kernel in KERNELS for length in LENGTHS]
+    values, vectors = torch.linalg.eigh(torch.stack(every) + CONSTANT)
+    return values, vectors
 
 
 def improbability(lengths: Tensor) -> Tensor:

@@ -41,18 +41,18 @@ class LossTransform:
 
 
 def transformed(values: Tensor) -> tuple[list[LossTransform], Tensor, Tensor]:
-    """Return the transforms to choose from, the values on their scales, and the mean log slope of each.
+    """Return the transforms to choose from, transformed losses, and the mean log slope of each transform.
 
     Args:
-        values: losses [P] above the lowest one, the largest of the order of 1.
+        values: losses [P] above the lowest one, which is 0; the largest is of the order of 1.
 
     Returns:
-        Transforms, values [P, T] and means [T].
+        Transforms, losses [P, T], and means [T] over all losses but the lowest one, where every slope is 1.
     """
     shifts = torch.tensor(_SHIFTS, dtype=values.dtype, device=values.device)
     v = values[:, None]
     squares, logarithms = v + v.square() / (2.0 * shifts), shifts * (v / shifts).log1p()
-    slopes = (v / shifts).log1p().mean(0)
+    slopes = (v / shifts).log1p().sum(0) / max(len(v) - 1, 1)
     kinds: tuple[Literal["square", "logarithm"], ...] = ("square", "logarithm")
     transforms = [LossTransform(kind, shift) for kind in kinds for shift in _SHIFTS]
     return transforms, torch.cat([squares, logarithms], 1), torch.cat([slopes, -slopes])

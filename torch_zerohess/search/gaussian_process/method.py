@@ -20,7 +20,7 @@ from torch_zerohess.search.descent.pool_quadratic import quadratic_of_pool
 from torch_zerohess.search.gaussian_process.candidates import farthest, is_known, least_known, lowest
 from torch_zerohess.search.gaussian_process.loss_model import LossModel
 from torch_zerohess.search.gaussian_process.progress import ProcessProgress
-from torch_zerohess.search.gaussian_process.warp import LOOK, warped
+from torch_zerohess.search.gaussian_process.warp import LOOK, likeliest, warped
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal, orthonormal
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
@@ -260,6 +260,8 @@ class ProcessMethod(Method[Q]):
         looks = noise > 0.0 and known.iterations % LOOK == 0
         if noise and not looks:  # a warp changes high losses alone: the best point keeps its loss
             values = warped(known.pool.points, values, noise, self._structures)
+        elif not noise and len(values) > self.settings.n + 1:
+            values = likeliest(known.pool.points, values, self._structures)
         known, process = self._fitted(known, values[:, None], noise)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]

@@ -12,13 +12,17 @@ by a process of the losses as they are. This step does not move the best point: 
 import math
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, grid_evidence
+from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, grid_evidence, transformed_evidence
 from torch_zerohess.surrogates.kernels import Structure
+from torch_zerohess.surrogates.loss_transform import transformed
 
 LOOK = 4
 """One step in so many looks for other basins."""
+_PLAIN = 3.0
+"""Twice the log prior of losses as they are, over a transform."""
 _UNITS = (300.0, 30.0)
 """Units u of a warp, over the noise, to choose from. No warp is the third choice."""
 
@@ -43,3 +47,18 @@ def warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequenc
         if total > highest:
             likely, highest = values, total
     return likely
+
+
+def likeliest(points: Tensor, losses: Tensor, structures: Sequence[Structure]) -> Tensor:
+    """Return losses [P] without noise under the transform with the highest evidence, or as they are.
+
+    Args:
+        points: [P, n].
+        losses: [P], the lowest one 0, the highest one at most 1.
+        structures: of the kernel of the process.
+    """
+    _, columns, slopes = transformed(losses)
+    columns, slopes = torch.cat([columns, losses[:, None]], 1), torch.cat([slopes, slopes.new_zeros(1)])
+    evidence = transformed_evidence(points, columns, structures) + 2.0 * len(points) * slopes
+    evidence[-1] += _PLAIN
+    return columns[:, int(evidence.argmax())]

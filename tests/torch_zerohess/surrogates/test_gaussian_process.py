@@ -14,6 +14,7 @@ from torch_zerohess.surrogates.gaussian_process import (
     NOISES,
     GaussianProcess,
     grid_evidence,
+    transformed_evidence,
 )
 from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.kernels import KERNELS, distances, gaussian, matern
@@ -93,6 +94,14 @@ def test_the_evidence_is_the_likelihood_and_the_prior_of_the_length():
                 same_for_all = torch.full((2,), length, dtype=torch.float64)
                 same = log_evidence(points, change / size, kernel, same_for_all, torch.tensor(noise).double())
                 assert float(same) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+def test_the_highest_evidence_of_each_column_is_that_of_its_process():
+    points = 1.5 * normal(9, 2)
+    columns = waves(points)
+    columns = (columns - columns.mean(0)) / columns.abs().max()
+    alone = [grid_evidence(points, one[:, None], NOISES)[0].max() for one in columns.mT]
+    torch.testing.assert_close(transformed_evidence(points, columns + 3.0), torch.stack(alone))
 
 
 def test_a_known_deviation_counts_as_seven_values_of_noise_alone():

@@ -1,9 +1,12 @@
 """The quadratic of least change against closed forms and against a direct minimisation of the change."""
 
+import math
+
 import pytest
 import torch
 
-from torch_zerohess.surrogates.least_change import LeastNorm, least_change
+from torch_zerohess.surrogates.least_change import LeastNorm, least_change, least_change_of_transform
+from torch_zerohess.surrogates.loss_transform import LossTransform
 from truths import vector
 
 
@@ -157,3 +160,43 @@ def test_few_points_tell_the_jacobian_along_them(P):
 def test_where_all_points_round_to_the_center_the_jacobian_is_zero():
     u = torch.zeros(3, 2, dtype=torch.float64)
     assert not LeastNorm.through(u, u).jacobian.any()
+
+
+@pytest.mark.parametrize("kind", ["square", "logarithm"])
+@pytest.mark.parametrize("shift", [20 / 1.5**4, 20 / 1.5**12, 20 / 1.5**20])
+@pytest.mark.parametrize("n", [2, 5])
+def test_the_transform_that_losses_were_made_with_is_the_likeliest(kind, shift, n):
+    """Losses up to 1 whose square or logarithm with this shift, one of those to choose from, is a quadratic."""
+    u = points((n + 1) * (n + 2) // 2 + n, n, n)
+    u[0] = 0.0
+    A = torch.randn(n, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
+    H = A @ A.mT + torch.eye(n, dtype=torch.float64)
+    quadratic = ((u @ H) * u).sum(1)
+    highest = (1.0 + shift) ** 2 / (2 * shift) - shift / 2 if kind == "square" else shift * math.log1p(1.0 / shift)
+    quadratic, H = quadratic * highest / quadratic.max(), 2.0 * H * highest / quadratic.max()
+    losses = (
+        (shift**2 + 2 * shift * quadratic).sqrt() - shift if kind == "square" else shift * (quadratic / shift).expm1()
+    )
+    transform, gradient, hessian = least_change_of_transform(u, losses, torch.zeros_like(H), None)
+    assert (transform.kind, transform.shift) == (kind, pytest.approx(shift))
+    torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-3 * float(H.norm()))
+    torch.testing.assert_close(hessian, H, rtol=0, atol=1e-3 * float(H.norm()))
+    assert transform.inverse(0.5 * float(u[3] @ hessian @ u[3])) == pytest.approx(float(losses[3]), rel=1e-2)
+
+
+def test_the_hessian_of_an_earlier_square_is_told_to_a_later_one():
+    """Two points more than the slopes need; the Hessian of a square with three times the shift is a third of it."""
+    n = 5
+    u = points(2 * n + 1, n, 3)
+    u[0] = 0.0
+    H = torch.diag(vector(1.0, 2.0, 3.0, 4.0, 5.0))
+    shift = 20 / 1.5**12
+    quadratic = ((u @ H) * u).sum(1)
+    highest = (1.0 + shift) ** 2 / (2 * shift) - shift / 2
+    losses = (shift**2 + 2 * shift * quadratic * highest / quadratic.max()).sqrt() - shift
+    true = 2.0 * H * highest / float(quadratic.max())
+    found = [
+        least_change_of_transform(u, losses, told, earlier)[2]
+        for told, earlier in [(true / 3, LossTransform("square", 3 * shift)), (true, LossTransform("square", shift))]
+    ]
+    torch.testing.assert_close(found[0], found[1])

@@ -5,7 +5,8 @@ among the outputs that lie within `_OPTIMISM` standard deviations of the predict
 composite function: Astudillo and Frazier 2019). If the process knows that point already, the search evaluates the point
 of the largest uncertainty, so it escapes local minima and plateaus.
 
-In noise the best point is the one whose *predicted* output has the lowest loss. A noisy loss is `warped`.
+A loss alone is predicted on the scale with the highest evidence (`likeliest`, and `warped` in noise). In noise the best
+point is the one whose *predicted* output has the lowest loss.
 """
 
 import math
@@ -260,7 +261,7 @@ class ProcessMethod(Method[Q]):
         looks = noise > 0.0 and known.iterations % LOOK == 0
         if noise and not looks:  # a warp changes high losses alone: the best point keeps its loss
             values = warped(known.pool.points, values, noise, self._structures)
-        elif not noise and len(values) > self.settings.n + 1:
+        elif self.settings.loss is None and not noise and len(values) > self.settings.n + 1:
             values = likeliest(known.pool.points, values, self._structures)
         known, process = self._fitted(known, values[:, None], noise)
         if known.noisy:

@@ -1,12 +1,17 @@
-"""A warp of noisy losses that span many decades: a stationary process follows them only on a log scale.
+"""Scales of losses on which a process predicts them: logarithms, squares, or the losses as they are.
 
-The warp of losses v >= 0 above the lowest one is y = u asinh(v / u): equal to v up to about u, and a logarithm beyond.
-The slope is 1 where losses are low, so noise keeps its standard deviation there. Noise of high losses becomes smaller
-than the process takes it to be. The evidence of the process chooses u, as it chooses the kernel: the likelihood of y
-times the slopes dy/dv is a likelihood of v (Snelson, Rasmussen and Ghahramani 2004).
+A stationary process varies as fast everywhere. Losses that span many decades do so only on a log scale. The root of a
+mean square has a kink at its minimum, and its square has none. The evidence of the process chooses the scale, as it
+chooses the kernel: the likelihood of transformed losses y times the slopes dy/dv is a likelihood of the losses v
+(Snelson, Rasmussen and Ghahramani 2004).
 
-A process of logarithms knows only the flanks of other basins, and expects nothing lower there. So one step in `LOOK` is
-by a process of the losses as they are. This step does not move the best point: its process does not resolve low losses.
+Losses without noise have the transforms of `LossTransform`. Noisy losses v >= 0 above the lowest one are warped, to
+y = u asinh(v / u): equal to v up to about u, and a logarithm beyond. The slope is 1 where losses are low, so noise
+keeps its standard deviation there. Noise of high losses becomes smaller than the process takes it to be.
+
+A process of warped losses knows only the flanks of other basins, and expects nothing lower there. So in noise one step
+in `LOOK` is by a process of the losses as they are. This step does not move the best point: its process does not
+resolve low losses.
 """
 
 import math
@@ -22,13 +27,13 @@ from torch_zerohess.surrogates.loss_transform import transformed
 LOOK = 4
 """One step in so many looks for other basins."""
 _PLAIN = 3.0
-"""Twice the log prior of losses as they are, over a transform."""
+"""Log prior of losses as they are, over that of a transform; times 2."""
 _UNITS = (300.0, 30.0)
 """Units u of a warp, over the noise, to choose from. No warp is the third choice."""
 
 
 def warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
-    """Return losses [P] on the scale on which a process has the highest evidence: warped, or as they are.
+    """Return noisy losses [P] on the scale on which a process has the highest evidence: warped, or as they are.
 
     Args:
         points: [P, n].
@@ -50,7 +55,7 @@ def warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequenc
 
 
 def likeliest(points: Tensor, losses: Tensor, structures: Sequence[Structure]) -> Tensor:
-    """Return losses [P] without noise under the transform with the highest evidence, or as they are.
+    """Return losses [P] without noise on the scale on which a process has the highest evidence.
 
     Args:
         points: [P, n].

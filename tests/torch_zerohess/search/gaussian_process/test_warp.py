@@ -1,4 +1,4 @@
-"""The warp of noisy losses: the scale that the losses were made with is found, and a search over decades arrives."""
+"""Scales of losses: the one that losses were made with is found, and a search over decades arrives."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_zerohess.optim import GaussianProcessSearch
-from torch_zerohess.search.gaussian_process.warp import warped
+from torch_zerohess.search.gaussian_process.warp import likeliest, warped
 from truths import vector
 
 
@@ -25,6 +25,29 @@ def test_the_evidence_finds_the_scale_on_which_losses_are_smooth(unit):
         size = float(losses.max())
         scaled = size * warped(points, losses / size, 1.0 / size, ("joint",))
         found += torch.allclose(scaled, losses if unit == math.inf else unit * (losses / unit).asinh())
+    assert found >= 8
+
+
+@pytest.mark.parametrize("made", ["square", "logarithm", "losses"])
+def test_the_evidence_finds_the_transform_of_losses_without_noise(made):
+    """Losses up to 1 whose square or logarithm, with the shift 0.1, is a sum of waves: found eight of ten times.
+
+    A shift is found if the process gets the waves, scaled, to a tenth of their deviation.
+    """
+    found = 0
+    for seed in range(10):
+        generator = torch.Generator().manual_seed(seed)
+        points = 4.0 * torch.rand(40, 2, generator=generator, dtype=torch.float64) - 2.0
+        waves = torch.sin(1.5 * points).sum(1) + torch.cos(points[:, 0] - points[:, 1])
+        smooth = (waves - waves.min()) / (waves.max() - waves.min())
+        made_from = {
+            "square": (0.01 + 1.2 * smooth).sqrt() - 0.1,
+            "logarithm": 0.1 * (2.397895 * smooth).expm1(),
+            "losses": smooth,
+        }
+        scaled = likeliest(points, made_from[made], ("joint",))
+        off = scaled - scaled.mean() - (scaled.std() / smooth.std()) * (smooth - smooth.mean())
+        found += float(off.std()) < 0.1 * float(scaled.std())
     assert found >= 8
 
 
@@ -66,3 +89,19 @@ def test_a_warped_loss_hides_no_other_basin(seed):
         return torch.minimum(8.0 + 20.0 * near.square().sum(1), 50.0 * far.square().sum(1))
 
     assert searched(loss, vector(-0.8, -1.0), 0.5, (-4.0, 4.0), 0.5, seed, 160) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("f", "most"),
+    [(lambda u: u.exp() + (-2.0 * u).exp() - 1.889881574842309, 17), (lambda u: u**2 + u**4, 14)],
+    ids=["exponentials", "fourth powers"],
+)
+def test_a_steep_loss_without_noise_takes_few_evaluations(f, most):
+    """The median of five seeds until 1e-4 of the first gap; the minimum is 0. As they are, losses take 20 or more."""
+    counts, x0, center = [], vector(-2.5, -2.0), vector(0.4, -0.3)
+    for seed in range(5):
+        search = GaussianProcessSearch(x0, sigma=2.0, bounds=(-5.0, 5.0), seed=seed, restarts=100)
+        while search.value > 1e-4 * float(f(x0 - center).sum()):
+            search.tell(f(search.ask() - center).sum(1))
+        counts.append(search.evaluations)
+    assert sorted(counts)[2] <= most

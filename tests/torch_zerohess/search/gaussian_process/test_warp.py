@@ -32,7 +32,7 @@ def test_the_evidence_finds_the_scale_on_which_losses_are_smooth(unit):
 def test_the_evidence_finds_the_transform_of_losses_without_noise(made):
     """Losses up to 1 whose square or logarithm, with the shift 0.1, is a sum of waves: found eight of ten times.
 
-    A shift is found if the process gets the waves, scaled, to a tenth of their deviation.
+    A shift is found if the process gets the waves, scaled, to a tenth of their deviation. Waves stay as they are.
     """
     found = 0
     for seed in range(10):
@@ -47,7 +47,7 @@ def test_the_evidence_finds_the_transform_of_losses_without_noise(made):
         }
         scaled = likeliest(points, made_from[made], ("joint",))
         off = scaled - scaled.mean() - (scaled.std() / smooth.std()) * (smooth - smooth.mean())
-        found += float(off.std()) < 0.1 * float(scaled.std())
+        found += torch.equal(scaled, smooth) if made == "losses" else float(off.std()) < 0.1 * float(scaled.std())
     assert found >= 8
 
 

@@ -10,7 +10,8 @@ also has a multiple of the identity, with a normal factor. With more than four p
 earlier Hessian, as in self-scaling quasi-Newton methods (Oren and Luenberger 1974). And a value at u differs from the
 quadratic by a normal number whose variance grows as |u|^6. How fast it grows depends on the function. Many values
 choose between two rates by their likelihoods (Rasmussen and Williams 2006, section 5.4). Few values get the faster
-rate: quadratics through far points fit them nearly always, and the slopes of these quadratics are wrong.
+rate: quadratics through far points fit them nearly always, and the slopes of these quadratics are wrong. By the same
+likelihoods, losses may choose a transform (`LossTransform`).
 """
 
 import math

@@ -45,6 +45,10 @@ class Descent(AskTell[Any]):
     search starts again, up to `restarts` times: from a random point, or in turn from a random point and around the best
     one with more samples per iteration.
 
+    The quadratic of least change may also be of the square or the logarithm of a loss alone, with a shift, where that
+    quadratic has predicted the latest losses better: of the square of a root of a mean square, which is a quadratic, and
+    of the logarithm of a loss that grows steeply.
+
     Where a loss alone is not finite, a plane between evaluations with and without a value bounds the step, so that the
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.
 
@@ -62,10 +66,10 @@ class Descent(AskTell[Any]):
 
     It has the settings of `AskTell`.
 
-    Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
-    order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Magnani and Boyd (2009) for the two
-    sides of a kink; Burke, Lewis and Overton (2005) for slopes around it; Langerman, Seront and Bersini (1994) for the
-    axes.
+    Source: Powell (2004) for the quadratic of least change; Box and Cox (1964) for squares and logarithms; Wang,
+    Fischer and Ritschel (2025) for the smoothed second order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by
+    interpolation; Magnani and Boyd (2009) for the two sides of a kink; Burke, Lewis and Overton (2005) for slopes
+    around it; Langerman, Seront and Bersini (1994) for the axes.
 
     Example:
         >>> import torch

@@ -17,7 +17,8 @@ class GaussianProcessSearch(AskTell[Any]):
       promises to take away a tenth of the loss, or more than an evaluation of the process gains; before the search ends
       it begins for less. It begins right after the first samples where it promises three tenths. Once it has arrived,
       it begins at random points of the box, too, twice for each turn of the process.
-    - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
+    - With the loss alone, the process predicts the loss, or without noise its square or logarithm where that is
+      likelier. Quadratics (`Descent`) finish in each basin it finds.
       Where the process finds nothing better, quadratics begin at a random point of the box. While arrivals disagree,
       quadratics begin beside the best point every other time. Where the loss is a sum of functions of one parameter
       each, with several minima, its axes are searched instead, as by `Descent`.
@@ -45,7 +46,7 @@ class GaussianProcessSearch(AskTell[Any]):
 
     Source: Rasmussen and Williams (2006) for the process; Astudillo and Frazier (2019) for the composite function;
     Duvenaud, Nickisch and Rasmussen (2011) for additive kernels; Snelson, Rasmussen and Ghahramani (2004) for the
-    scale.
+    choice of a scale.
 
     Example:
         >>> import torch

@@ -45,9 +45,9 @@ class Descent(AskTell[Any]):
     search starts again, up to `restarts` times: from a random point, or in turn from a random point and around the best
     one with more samples per iteration.
 
-    The quadratic of least change may also be of the square or the logarithm of a loss alone, with a shift, where that
-    quadratic has predicted the latest losses better: of the square of a root of a mean square, which is a quadratic, and
-    of the logarithm of a loss that grows steeply.
+    The quadratic of least change may also be of the square or the logarithm of a loss alone, where that quadratic has
+    predicted the latest losses better. The square of the root of a mean square is a quadratic. A loss that grows
+    steeply is closer to a quadratic on a log scale.
 
     Where a loss alone is not finite, a plane between evaluations with and without a value bounds the step, so that the
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.

@@ -5,8 +5,7 @@ among the outputs that lie within `_OPTIMISM` standard deviations of the predict
 composite function: Astudillo and Frazier 2019). If the process knows that point already, the search evaluates the point
 of the largest uncertainty, so it escapes local minima and plateaus.
 
-A loss alone is predicted on the scale with the highest evidence (`likeliest`, and `warped` in noise). In noise the best
-point is the one whose *predicted* output has the lowest loss.
+In noise the best point is the one whose *predicted* output has the lowest loss. A loss has its `likeliest` scale.
 """
 
 import math
@@ -21,7 +20,7 @@ from torch_zerohess.search.descent.pool_quadratic import quadratic_of_pool
 from torch_zerohess.search.gaussian_process.candidates import farthest, is_known, least_known, lowest
 from torch_zerohess.search.gaussian_process.loss_model import LossModel
 from torch_zerohess.search.gaussian_process.progress import ProcessProgress
-from torch_zerohess.search.gaussian_process.warp import LOOK, likeliest, warped
+from torch_zerohess.search.gaussian_process.warp import LOOK, likeliest
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal, orthonormal
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
@@ -259,10 +258,8 @@ class ProcessMethod(Method[Q]):
         values = (values - least) / spread  # neither their squares nor that of the noise overflow
         noise = self.settings.noise / spread
         looks = noise > 0.0 and known.iterations % LOOK == 0
-        if noise and not looks:  # a warp changes high losses alone: the best point keeps its loss
-            values = warped(known.pool.points, values, noise, self._structures)
-        elif self.settings.loss is None and not noise and len(values) > self.settings.n + 1:
-            values = likeliest(known.pool.points, values, self._structures)
+        if not looks and (noise or self.settings.loss is None):  # the best point keeps its loss on every scale
+            values = likeliest(known.pool.points, values, noise, self._structures)
         known, process = self._fitted(known, values[:, None], noise)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]

@@ -32,15 +32,22 @@ _UNITS = (300.0, 30.0)
 """Units u of a warp, over the noise, to choose from. No warp is the third choice."""
 
 
-def warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
-    """Return noisy losses [P] on the scale on which a process has the highest evidence: warped, or as they are.
+def likeliest(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
+    """Return losses [P] on the scale on which a process has the highest evidence.
 
     Args:
         points: [P, n].
         losses: [P], the lowest one 0, the highest one at most 1.
-        deviation: standard deviation of repeated losses at one point.
+        deviation: standard deviation of repeated losses at one point; 0 if they are the same.
         structures: of the kernel of the process.
     """
+    if deviation:
+        return _warped(points, losses, deviation, structures)
+    return _transformed(points, losses, structures) if len(points) > points.shape[1] + 1 else losses
+
+
+def _warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
+    """Return noisy losses, warped or as they are."""
     likely, highest = losses, -math.inf
     for unit in (math.inf, *(one * deviation for one in _UNITS)):
         scaled = losses / unit
@@ -54,14 +61,8 @@ def warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequenc
     return likely
 
 
-def likeliest(points: Tensor, losses: Tensor, structures: Sequence[Structure]) -> Tensor:
-    """Return losses [P] without noise on the scale on which a process has the highest evidence.
-
-    Args:
-        points: [P, n].
-        losses: [P], the lowest one 0, the highest one at most 1.
-        structures: of the kernel of the process.
-    """
+def _transformed(points: Tensor, losses: Tensor, structures: Sequence[Structure]) -> Tensor:
+    """Return losses without noise, under a transform or as they are."""
     _, columns, slopes = transformed(losses)
     columns, slopes = torch.cat([columns, losses[:, None]], 1), torch.cat([slopes, slopes.new_zeros(1)])
     evidence = transformed_evidence(points, columns, structures) + 2.0 * len(points) * slopes

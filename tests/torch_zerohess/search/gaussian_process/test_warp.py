@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_zerohess.optim import GaussianProcessSearch
-from torch_zerohess.search.gaussian_process.warp import likeliest, warped
+from torch_zerohess.search.gaussian_process.warp import likeliest
 from truths import vector
 
 
@@ -23,7 +23,7 @@ def test_the_evidence_finds_the_scale_on_which_losses_are_smooth(unit):
         losses = losses + torch.randn(60, generator=generator, dtype=torch.float64)  # noise of standard deviation 1
         losses = losses - losses.min()
         size = float(losses.max())
-        scaled = size * warped(points, losses / size, 1.0 / size, ("joint",))
+        scaled = size * likeliest(points, losses / size, 1.0 / size, ("joint",))
         found += torch.allclose(scaled, losses if unit == math.inf else unit * (losses / unit).asinh())
     assert found >= 8
 
@@ -45,7 +45,7 @@ def test_the_evidence_finds_the_transform_of_losses_without_noise(made):
             "logarithm": 0.1 * (2.397895 * smooth).expm1(),
             "losses": smooth,
         }
-        scaled = likeliest(points, made_from[made], ("joint",))
+        scaled = likeliest(points, made_from[made], 0.0, ("joint",))
         off = scaled - scaled.mean() - (scaled.std() / smooth.std()) * (smooth - smooth.mean())
         found += torch.equal(scaled, smooth) if made == "losses" else float(off.std()) < 0.1 * float(scaled.std())
     assert found >= 8
@@ -56,7 +56,7 @@ def test_losses_that_overflow_over_the_noise_are_not_warped(deviation):
     points = torch.linspace(-1.0, 1.0, 8, dtype=torch.float64)[:, None]
     losses = (points[:, 0] - points[0, 0]).exp() / 10
     losses = losses - losses.min()
-    assert torch.equal(warped(points, losses, deviation, ("joint",)), losses)
+    assert torch.equal(likeliest(points, losses, deviation, ("joint",)), losses)
 
 
 def searched(loss, x0, sigma, bounds, noise, seed, evaluations):

@@ -4,8 +4,8 @@ The root of a mean square is a cone at its minimum, but its square is a quadrati
 powers grow so steeply that their logarithm is closer to a quadratic.
 
 Losses v >= 0 above the lowest one become ((v + c)^2 - c^2) / (2 c) or c log(1 + v / c), with a shift c > 0. Both are
-about v where v is far below c, and both rise with v: the minimum stays where it is. The shift and the kind are chosen
-by the likelihood of the values. It has one factor for every value, the slope of the transform there.
+about v where v is far below c, and both rise with v: the minimum stays where it is. Kind and shift are chosen by the
+likelihood of the losses. The likelihood of a loss is the likelihood of its transform times the slope there.
 """
 
 import math
@@ -27,7 +27,7 @@ class LossTransform:
 
     kind: Literal["square", "logarithm"]
     shift: float
-    """In units of the losses; above 0."""
+    """c, in units of the losses; above 0."""
 
     def inverse(self, y: float) -> float:
         """Return the loss above the lowest one; minus the shift where a quadratic predicts less than any square."""
@@ -36,7 +36,7 @@ class LossTransform:
         return math.sqrt(max(self.shift * (self.shift + 2.0 * y), 0.0)) - self.shift
 
     def hessian_ratio(self, other: "LossTransform") -> float:
-        """Return the Hessian on this scale over the Hessian on the other one. Only squares of one kind are told."""
+        """Return a Hessian under this transform over the same under the other one; 1 unless both are squares."""
         return other.shift / self.shift if self.kind == other.kind == "square" else 1.0
 
 

@@ -2,8 +2,8 @@
 
 The root of a mean square has a kink at its minimum, and its square is a quadratic. On a loss that grows steeply, as
 a sum of exponentials, quadratics of its logarithm are valid in a larger region. At every step a quadratic is fitted to
-the losses, and another one to the losses under their likeliest transform (`LossTransform`). Both rise and fall
-together, so the minimum of either is a step. Steps lead to the minimum of the one that has predicted the latest losses
+the losses, and another one to the losses under their likeliest transform (`LossTransform`). A transform rises with the
+loss, so it has the same minimum. Steps lead to the minimum of the quadratic that has predicted the latest losses
 better.
 """
 

@@ -141,5 +141,5 @@ def check_aux(aux: Sequence[Tensor], memory: object, head: object) -> None:
     if aux and memory is not None and head is None:
         raise ValueError(
             f"aux must be empty with a memory and no head, got {len(aux)} tensors: fn gets points alone, and what "
-            "depends on aux belongs into head"
+            "depends on aux belongs in head"
         )

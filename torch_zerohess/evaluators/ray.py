@@ -43,7 +43,7 @@ class Ray(Ahead):
     RAY_ADDRESS is used, and without one a Ray of this machine alone, which ends with `close()`.
 
     Ray listens on the addresses of its machines, also a Ray of one machine, and runs any code of whoever may connect:
-    it belongs into a network of its own, or behind its token authentication. `ProcessPool` listens nowhere.
+    it belongs in a network of its own, or behind its token authentication. `ProcessPool` listens nowhere.
 
     Args:
         actors: number of actors; as many as the cluster has cores if None.

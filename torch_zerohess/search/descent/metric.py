@@ -261,9 +261,10 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         return known.scaled[chosen], values / size, size
 
     def _earlier(self, known: MetricProgress, hessian: Tensor, ratio: float, u: Tensor, values: Tensor) -> Tensor:
-        """Return an earlier Hessian [n, n] in the units of u and of values [P]; of the first values it is their own.
+        """Return the earlier Hessian [n, n] by u, in the unit of the values [P].
 
-        ratio: of the units of the Hessian and of the values.
+        Up to 2 n values, it is the Hessian of a quadratic through them. ratio: the unit of the Hessian over the unit of
+        the values.
         """
         if len(known.values) <= 2 * self._n:
             return fit_values(u, values, torch.ones_like(values)).full_hessian()
@@ -280,7 +281,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
 
 def of_step(known: MetricProgress, gradient: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
-    """Return gradient [n] and Hessian [n, n] by a step s, given those by u."""
+    """Return gradient [n] and Hessian [n, n] by the step s = sigma B u, given gradient and Hessian by u."""
     back = torch.linalg.inv(known.sigma * known.root)
     hessian = back.mT @ hessian @ back
     return back.mT @ gradient, 0.5 * (hessian + hessian.mT)

@@ -81,7 +81,7 @@ class Space:
         wrong = ~((points >= self.lower) & (points <= self.upper) & torch.isfinite(points)).all(1)
         if bool(wrong.any()):
             k = int(wrong.nonzero()[0])
-            raise ValueError(f"points must be finite and within the bounds, got {points[k].tolist()} as number {k}")
+            raise ValueError(f"points must be finite and within the bounds, got {points[k].tolist()} for point {k}")
         return points.detach()
 
     def coordinates(self, x: Tensor) -> Tensor:

@@ -79,7 +79,7 @@ def _check_loss(loss: Any, shape: list[int]) -> None:
     if not isinstance(loss, Tensor):
         raise ReturnedTypeError(
             f"loss must return a tensor, which torch differentiates, got {type(loss).__name__} for one output of shape "
-            f"{shape}: a loss that torch cannot compute belongs into the black box, which then returns the loss"
+            f"{shape}: a loss that torch cannot compute belongs in the black box, which then returns the loss"
         )
     if loss.numel() != 1:
         raise ReturnedValueError(

@@ -404,8 +404,8 @@ def test_a_search_goes_on_from_evaluations_of_the_caller(kind):
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        ([[0.0, 0.0], [0.0, 2.5]], r"within the bounds, got \[0.0, 2.5\] as number 1"),
-        ([[0.0, 0.0], [0.0, math.nan]], r"finite and within the bounds, got \[0.0, nan\] as number 1"),
+        ([[0.0, 0.0], [0.0, 2.5]], r"within the bounds, got \[0.0, 2.5\] for point 1"),
+        ([[0.0, 0.0], [0.0, math.nan]], r"finite and within the bounds, got \[0.0, nan\] for point 1"),
         ([0.0, 0.0], r"points must have shape \[K, 2\], the start first, got \[2\]"),
         ([[0.0], [1.0]], r"points must have shape \[K, 2\], the start first, got \[2, 1\]"),
         ("zero", r"points must be numbers \[K, 2\], got 'zero'"),

@@ -92,5 +92,5 @@ def test_errors_of_a_loss_that_has_returned_values_are_the_callers_own(graph) ->
 
 def test_where_a_loss_belongs_that_torch_cannot_compute() -> None:
     search = zh.optim.TrustRegion([0.7, 0.2], sigma=0.3, loss=lambda y: float(y.sum()), seed=0)
-    with pytest.raises(TypeError, match="that torch cannot compute belongs into the black box"):
+    with pytest.raises(TypeError, match="that torch cannot compute belongs in the black box"):
         search.tell(image(search.ask()))

@@ -74,7 +74,8 @@ def estimate(
             `draws` limit the accuracy.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
-        value: "center" returns f(x) as the value, "smoothed" an estimate of F(x).
+        value: "center" returns f(x) as the value, "smoothed" the estimate of F(x). Its standard error is that of F(x)
+            in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
             "drop" is unbiased only where fn fails at random. Where it fails in a region, derivatives are of a Gaussian
             without this region, and standard errors do not tell: look at `Estimate.dropped`.

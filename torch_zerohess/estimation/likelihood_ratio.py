@@ -50,7 +50,10 @@ class LikelihoodRatio(Divisible):
         if density == proposals.UNIFORM:
             if bool((weight == 0).all(1).any()):
                 raise ValueError(
-                    f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
+                    f"proposal must have a weight above zero for some sample, got {smoothing.proposal!r} at {n} "
+                    "parameters: nearly all of its box lies where the normal density is so small that every weight "
+                    "N(u) / p(u) is rounded to zero. Use proposal 'aggregate', which is for any number of parameters, "
+                    "or 'gaussian'"
                 )
             _warn_of_few(smoothing.samples, n)
         return points, made

@@ -29,9 +29,10 @@ class ConfidenceInterval(NamedTuple):
 class Estimate:
     """Estimates of F(x) = E f(x + sigma u) and its derivatives, all from the same samples (Stein's identities).
 
-    `value` and `gradient` are attributes. Second derivatives are methods, because they are formed when asked for:
-    `hvp(v)`, `hessian_diagonal()`, `hessian()`. `standard_error` and `confidence_interval` say how far each may be from
-    the truth. Shapes, for x [*batch, n] and a black box with output [*out]: see each of them. Made by `estimate`.
+    `value` and `gradient` are attributes. Second derivatives are methods, formed when asked for: `hvp(v)`,
+    `hessian_diagonal()`, `hessian()`. Standard errors and intervals are of F and its derivatives. `value` is f(x) and
+    has none, unless `value="smoothed"` was asked for; the printed estimate says which of the two it is. Shapes, for x
+    [*batch, n] and a black box with output [*out]: see each of them. Made by `estimate`.
 
     All but `evaluations` and `dropped` raise ValueError where a result does not exist in the dtype of x.
     """
@@ -59,7 +60,7 @@ class Estimate:
 
     @property
     def value(self) -> Tensor:
-        """f(x), or the estimate of F(x) where `value="smoothed"`: [*batch, *out]."""
+        """f(x), or the estimate of F(x) where `value="smoothed"` was asked for: [*batch, *out]."""
         B, P = self._batch.numel(), self._out.numel()
         base = combined(self._batches, lambda one: one.evaluations.expansion.base.reshape(B, P))
         smoothed = self._value_mode == "smoothed"
@@ -116,7 +117,7 @@ class Estimate:
         standard errors. With baseline "mean" the draws depend on each other, and the error is by the jackknife.
 
         Args:
-            quantity: "value" (of the smoothed value), "gradient", "hessian_diagonal", "hessian" or "hvp".
+            quantity: "value" (of the estimate of F(x), also where `value` is f(x)), "gradient", "hessian_diagonal", "hessian" or "hvp".
             v: the vector of the "hvp", [*batch, n] or [n].
 
         Raises:
@@ -219,17 +220,16 @@ class Estimate:
 
     def __repr__(self) -> str:
         shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
-        parts = [shape, attribute(self, "value"), attribute(self, "gradient")]
+        of = "F" if self._value_mode == "smoothed" else "f"
+        parts = [shape, f"{attribute(self, 'value')} ({of}(x))", attribute(self, "gradient")]
         parts += [f"auto: {self._chosen}"] * bool(self._chosen)
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
 
     def _once(self, name: str, make: Callable[[], Tensor]) -> Tensor:
         """Make a tensor once. What a transform of torch or inference mode makes is not kept: it serves nothing else."""
-        if name in self._made:
-            return self._made[name]
-        result = make()
-        if readable(result) and not result.is_inference():
+        result = self._made.get(name)
+        if result is None and readable(result := make()) and not result.is_inference():
             self._made[name] = result
         return result
 

@@ -14,7 +14,7 @@ class LinearSigma:
     """Move sigma of one or several layers linearly from `start` to `end` in `steps` steps, after `hold` at the start.
 
     Large sigmas cross plateaus, small ones find the minimum. As with a scheduler of torch, making it sets the first
-    value, each `step()` the next, and `state_dict` / `load_state_dict` resume it.
+    value, each `step()` the next, `get_last_sigma()` returns it, and `state_dict` / `load_state_dict` resume it.
 
     Args:
         module_or_modules: a `BlackBox` or `SparseBlackBox`, a module that contains some, or several of either.
@@ -49,6 +49,10 @@ class LinearSigma:
         """The current sigma, a number or float64 [n]."""
         share = min(max(self.count - self.hold, 0) / self.steps, 1.0)
         return (1.0 - share) * self.start + share * self.end  # without rounding at both ends
+
+    def get_last_sigma(self) -> list[float | Tensor]:
+        """Return the sigma that the last step set, once per layer, as `get_last_lr` of a scheduler of torch does."""
+        return [self.sigma for _ in self._layers]
 
     def __repr__(self) -> str:
         return f"LinearSigma({self.start} to {self.end}, steps={self.steps}, hold={self.hold}, count={self.count})"

@@ -407,15 +407,16 @@ def test_limits_out_of_range(limits: dict, error: type[Exception], message: str)
 
 
 def test_an_estimate_says_what_it_is() -> None:
-    got = estimate(
-        Quadratic(torch.zeros(2, 2).double(), vector(2.0, -1.0), 0.5), X, PLAIN.replace(proposal="gaussian", seed=0)
-    )
-    assert repr(got).startswith("Estimate(x [2], output [], value=1.3, gradient=[")
+    f, smoothing = Quadratic(torch.eye(2).double(), vector(2.0, -1.0), 0.5), PLAIN.replace(proposal="gaussian", seed=0)
+    got, smoothed = (estimate(f, X, smoothing, value=value) for value in ("center", "smoothed"))
+    assert repr(got).startswith(f"Estimate(x [2], output [], value={float(f(X[None])[0]):.4g} (f(x)), gradient=[")
     assert repr(got).endswith("], evaluations=33)")
+    assert f"value={float(smoothed.value):.4g} (F(x)), " in repr(smoothed)
+    assert torch.equal(got.standard_error("value"), smoothed.standard_error("value"))
     large = estimate(lambda z: z.repeat(1, 30), spread(6, 0.0, 1.0).view(3, 2), PLAIN)
-    shapes = "value of shape [3, 60], gradient of shape [3, 60, 2]"
+    shapes = "value of shape [3, 60] (f(x)), gradient of shape [3, 60, 2]"
     beyond = estimate(lambda z: 1e300 + z.double().sum(1), torch.zeros(2), Smoothing(sigma=1.0))
-    assert repr(beyond).startswith("Estimate(x [2], output [], value not finite, gradient=[")
+    assert repr(beyond).startswith("Estimate(x [2], output [], value not finite (f(x)), gradient=[")
     assert repr(large) == f"Estimate(x [3, 2], output [3, 60], {shapes}, evaluations=99)"
 
 

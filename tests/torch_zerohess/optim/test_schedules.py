@@ -43,6 +43,18 @@ def test_linear_sigma():
             zh.LinearSigma(nothing, 1.0, 0.5, steps=2)
 
 
+def test_the_last_sigma_is_that_of_every_layer():
+    """As `get_last_lr` of torch has one rate per group."""
+    layers = [zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0)) for _ in range(2)]
+    schedule = zh.LinearSigma(layers, 1.0, 0.5, steps=2)
+    for expected in (1.0, 0.75, 0.5):
+        assert schedule.get_last_sigma() == [expected, expected] == [layer.smoothing.sigma for layer in layers]
+        schedule.step()
+    each = zh.LinearSigma(layers, vector(1.0, 2.0), 0.5, steps=2)
+    each.get_last_sigma()[0].zero_()  # it is the caller's
+    assert torch.equal(each.sigma, vector(1.0, 2.0)) and torch.equal(layers[0].smoothing.sigma, vector(1.0, 2.0))
+
+
 def test_one_sigma_per_parameter():
     """From start to end, element by element; a number stands for all of them."""
     layers = [zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=sigma)) for sigma in (9.0, vector(3.0, 4.0))]

@@ -93,7 +93,8 @@ def minimize(
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
             and, with `loss` and at least 20 parameters, by the evaluations.
         batch: points that fn gets at once, where the search can use so many: fewer batches, more evaluations. Give the
-            number of `workers`, or how many points fn takes at once. See `TrustRegion.ask`.
+            number of `workers`, or how many points fn takes as fast as one. It is no upper limit: the first call has
+            the start and up to n samples. Let fn split a call that is too large for it. See `TrustRegion.ask`.
         vectorized: False for an fn of one point, [n] -> scalar or [*out]. The point is a tensor, too: NumPy code begins
             with `x = np.asarray(x)`.
         evaluator: where evaluations run; in this process if None.

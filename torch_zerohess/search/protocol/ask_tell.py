@@ -101,13 +101,17 @@ class AskTell(Standing[P]):
     def ask(self, batch: int = 1, *, limit: int | None = None) -> Tensor:
         """Return the next points to evaluate [K, n]; the same ones until they are told.
 
-        Once some of their values are told, these are the points whatever the batch.
+        K may be larger than the batch. The first points are the start and its samples, up to n + 1 of them in most
+        searches, and a later step may take several points, too. Evaluate as many of them at once as you can, and tell
+        each value when it is there: `tell(value, which=[k])`. Once some of their values are told, these are the points
+        whatever the batch.
 
         Args:
-            batch: how many evaluations run at once. If the search itself has fewer points to ask for, others are
+            batch: how many evaluations can run at once. If the search itself has fewer points to ask for, others are
                 added that are most informative beside them. They save rounds, not evaluations. `LocalGaussNewton` and
                 `BlockGaussNewton` add none.
-            limit: how many points there may be at most.
+            limit: how many points there may be at most. The step is then taken without the others, and is a worse one:
+                it is for the last evaluations that there are.
 
         ValueError for a batch or limit below 1, RuntimeError if the search is done.
         """
@@ -162,15 +166,19 @@ class AskTell(Standing[P]):
         self._take(values, points)
 
     def tell_at(self, values: Any, points: Any) -> None:
-        """Take values of points [K, n] that the caller has evaluated already, the start first; before any `tell`.
+        """Take values of points [K, n] that the caller has evaluated already; before any `tell`.
 
-        The search begins with a model of them, and takes fewer evaluations. Points are a tensor, an array or a list.
-        Otherwise as `tell`. RuntimeError if values have been told; ValueError for points that are not finite, or not
-        within the bounds.
+        The search begins with a model of them, and takes fewer evaluations. Points are a tensor, an array or a list, in
+        any order. One of them is the start x0: make the search at the best of them. Otherwise as `tell`. RuntimeError
+        if values have been told; ValueError for points that are not finite, not within the bounds, or without x0.
         """
         if self.evaluations or self._early:
             raise RuntimeError("values have been told: points of one's own come before")
-        self._take(converted(values, self.unit.device), self._space.coordinates(self._space.checked_points(points)))
+        values, points = converted(values, self.unit.device), self._space.checked_points(points)
+        if values.ndim and len(values) == len(points):  # otherwise what follows says what is wrong
+            order = self._space.start_first(points)
+            values, points = values[order], points[order]
+        self._take(values, self._space.coordinates(points))
 
     def _take(self, values: Tensor, points: Tensor) -> None:
         """Take a step with the values [K, *out] of points [K, n], in units of sigma."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import own_copy
-from torch_zerohess.estimation.inputs import check_no_derivative, working
+from torch_zerohess.estimation.inputs import check_no_derivative, short, working
 
 
 class Array(Protocol):
@@ -77,12 +77,23 @@ class Space:
         except (TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"points must be numbers [K, {n}], got {reprlib.repr(points)}") from error
         if points.ndim != 2 or points.shape[1] != n or not len(points):
-            raise ValueError(f"points must have shape [K, {n}], the start first, got {list(points.shape)}")
+            raise ValueError(f"points must have shape [K, {n}], got {list(points.shape)}")
         wrong = ~((points >= self.lower) & (points <= self.upper) & torch.isfinite(points)).all(1)
         if bool(wrong.any()):
             k = int(wrong.nonzero()[0])
             raise ValueError(f"points must be finite and within the bounds, got {points[k].tolist()} for point {k}")
         return points.detach()
+
+    def start_first(self, points: Tensor) -> Tensor:
+        """Return the order [K] of points [K, n] in which the start is the first. ValueError if it is none of them."""
+        found = (points.to(self.start.dtype) == self.start).all(1)
+        if not bool(found.any()):
+            raise ValueError(
+                f"points must have the start x0 = {short(self.start)} among them, with which the search begins, got "
+                f"{len(points)} others: make the search with one of them as x0, the best one, or evaluate x0, too"
+            )
+        order = torch.arange(len(points), device=points.device)
+        return torch.cat([order[found][:1], order[order != order[found][0]]])
 
     def coordinates(self, x: Tensor) -> Tensor:
         """Coordinates of parameters x, float64."""

@@ -401,13 +401,40 @@ def test_a_search_goes_on_from_evaluations_of_the_caller(kind):
     assert search.value < 1e-12
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_the_start_may_be_any_of_the_points(noise):
+    """The search is that of the points with the start first."""
+    points = vector(1.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, -1.0, 1.0, 1.0).view(6, 2)
+    first = [2, 0, 1, 3, 4, 5]
+    search, other = (Descent(zeros(2), sigma=0.5, noise=noise, seed=0) for _ in range(2))
+    values = (points - 0.25).square().sum(1)
+    search.tell_at(values, points)
+    other.tell_at(values[first], points[first])
+    assert torch.equal(search.ask(), other.ask())
+    assert search.value == other.value
+
+
+def test_a_start_of_float32_is_found_among_points_of_float64():
+    search = Descent(torch.tensor([0.1, 0.2]), sigma=0.5, seed=0)
+    search.tell_at([1.0, 2.0], [[1.0, 0.0], [0.1, 0.2]])
+    assert search.evaluations == 2
+
+
+def test_points_without_the_start():
+    """In noise, a search that does not know the value of its start does not find the minimum."""
+    search = Descent(zeros(2), sigma=0.5, seed=0)
+    with pytest.raises(ValueError, match=r"points must have the start x0 = \[0, 0\] among them, .* got 2 others"):
+        search.tell_at([0.0, 1.0], [[1.0, 0.0], [0.0, 1.0]])
+    assert search.evaluations == 0
+
+
 @pytest.mark.parametrize(
     ("points", "message"),
     [
         ([[0.0, 0.0], [0.0, 2.5]], r"within the bounds, got \[0.0, 2.5\] for point 1"),
         ([[0.0, 0.0], [0.0, math.nan]], r"finite and within the bounds, got \[0.0, nan\] for point 1"),
-        ([0.0, 0.0], r"points must have shape \[K, 2\], the start first, got \[2\]"),
-        ([[0.0], [1.0]], r"points must have shape \[K, 2\], the start first, got \[2, 1\]"),
+        ([0.0, 0.0], r"points must have shape \[K, 2\], got \[2\]"),
+        ([[0.0], [1.0]], r"points must have shape \[K, 2\], got \[2, 1\]"),
         ("zero", r"points must be numbers \[K, 2\], got 'zero'"),
     ],
 )

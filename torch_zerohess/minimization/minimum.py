@@ -1,5 +1,6 @@
 """The iterates of a minimisation, and its result."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -99,15 +100,22 @@ class Minimum:
         """Every point and its loss, in order: x [n], a row of `points`, and value, a float."""
         return [Observation(x, value) for x, value in zip(self.points, self.values.tolist(), strict=True)]
 
-    def covariance(self) -> Tensor:
+    def covariance(self, fixed: Sequence[int] = ()) -> Tensor:
         """Return the covariance of the parameters in the Laplace approximation, the inverse of `hessian` [n, n].
+
+        Args:
+            fixed: numbers of parameters that are held at their values in x, such as one that the data do not determine,
+                or one that takes whole numbers only. The covariance is that of the others for these values: their rows
+                and columns in the inverse of the Hessian without the fixed ones. Rows and columns of fixed parameters
+                are 0.
 
         The loss must be the negative logarithm of the likelihood, or of the posterior density. For residuals r with
         independent Gaussian errors of standard deviation s it is sum(r^2 / s^2) / 2. The standard deviations of the
         parameters are the roots of the diagonal. An error d of H_ii, from `standard_errors`, changes variance i by the
         share d C_ii, to first order.
 
-        Raises ValueError if the Hessian is not known, or if it is not positive definite within its errors.
+        Raises ValueError if the Hessian is not known, if that of the parameters that are not fixed is not positive
+        definite within its errors, or if `fixed` has no numbers of parameters, or all of them.
 
         Example:
             >>> from torch_zerohess import minimize
@@ -118,7 +126,7 @@ class Minimum:
         """
         if self.hessian is None or self.standard_errors is None:
             raise ValueError("the Hessian is not known, too few evaluations lie around x: give more max_evaluations")
-        return covariance(self.hessian, self.standard_errors["hessian_diagonal"])
+        return covariance(self.hessian, self.standard_errors["hessian_diagonal"], fixed)
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the loss of every evaluation, and the lowest so far as a line, and return the axes.

@@ -84,6 +84,55 @@ def test_a_parameter_that_the_data_do_not_determine_beside_another() -> None:
         fit.covariance()
 
 
+def test_fixed_parameters_are_held_at_their_values() -> None:
+    """The covariance given the fixed ones is smaller than that of the whole by the part that they explain."""
+    root = torch.tensor([[2.0, 0.3, -0.5], [0.1, 1.0, 0.4], [0.2, -0.6, 1.5]]).double()
+    H = root @ root.mT
+    whole, free = torch.linalg.inv(H), torch.tensor([0, 2])
+    explained = whole[:, 1:2] @ whole[1:2] / whole[1, 1]  # Schur complement of the fixed one
+    for fixed in ([1], [-2], (1, 1), torch.tensor([1])):
+        found = covariance(H, torch.zeros(3), fixed)
+        torch.testing.assert_close(found[free[:, None], free], (whole - explained)[free[:, None], free])
+        assert not found[1].any() and not found[:, 1].any()
+
+
+def test_a_parameter_that_is_not_determined_may_be_fixed() -> None:
+    H = torch.tensor([[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, -1.0]]).double()
+    with pytest.raises(ValueError, match=r"along parameter 2: .* by fixed=\[2\]"):
+        covariance(H, torch.zeros(3))
+    with pytest.raises(ValueError, match=r"along parameter ([01]): .* by fixed=\[\1\]"):
+        covariance(H, torch.zeros(3), [2])
+    assert torch.equal(covariance(H, torch.zeros(3), [1, 2]), torch.diag(torch.tensor([0.25, 0.0, 0.0]).double()))
+    errors = torch.tensor([0.5, 0.0, float("nan")])  # of a fixed parameter it does not matter
+    assert float(covariance(H, errors, [1, 2])[0, 0]) == 0.25
+    with pytest.raises(ValueError, match=r"variance of parameter 2, 1, may be wrong by 2 .* by fixed=\[2\]"):
+        covariance(torch.eye(3).double(), torch.tensor([0.0, 9.0, 2.0]), [1])
+
+
+@pytest.mark.parametrize(
+    ("fixed", "error", "message"),
+    [
+        ([2], ValueError, "fixed must be numbers of the 2 parameters, from 0 to 1, got 2"),
+        ([0, 1], ValueError, "fixed must leave a parameter whose covariance is sought, got all 2"),
+        (0, TypeError, r"fixed must be a list of numbers of parameters, as \[0\], got 0"),
+        ("0", TypeError, "fixed must be a list of numbers of parameters"),
+        ([0.0], TypeError, r"fixed must be an integer, got 0\.0"),
+        ([True, False], TypeError, "fixed must be an integer, got True"),
+    ],
+)
+def test_what_cannot_be_fixed(fixed, error, message) -> None:
+    fit = fitted(decay, outputs=False)
+    with pytest.raises(error, match=message):
+        fit.covariance(fixed)
+
+
+def test_the_covariance_of_a_fit_with_a_fixed_parameter() -> None:
+    fit = fitted(decay, outputs=False)
+    H = fit.hessian.double()
+    assert float(fit.covariance(fixed=[1])[0, 0]) == pytest.approx(1.0 / float(H[0, 0]), rel=1e-12)
+    assert float(fit.covariance()[0, 0]) > float(fit.covariance(fixed=[1])[0, 0])
+
+
 def test_a_hessian_that_is_not_known() -> None:
     fit = replace(fitted(decay, outputs=False), hessian=None)
     with pytest.raises(ValueError, match="not known, too few evaluations"):

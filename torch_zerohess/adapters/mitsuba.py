@@ -29,6 +29,7 @@ from torch import Tensor
 from torch_zerohess.adapters.mitsuba_description import Description, described, loaded
 from torch_zerohess.adapters.mitsuba_film import resize
 from torch_zerohess.adapters.mitsuba_parameters import Parameter, check_known, plain
+from torch_zerohess.adapters.mitsuba_render import rendered
 from torch_zerohess.adapters.mitsuba_sensors import Sensor, check_rendered, chosen
 from torch_zerohess.adapters.mitsuba_transforms import Transform
 from torch_zerohess.adapters.mitsuba_values import Value
@@ -190,6 +191,7 @@ class MitsubaScene:
             TypeError: x is no tensor.
             ValueError: x has another shape, or is not finite.
             FloatingPointError: a pixel is not finite.
+            RuntimeError: Mitsuba cannot render the scene; the message has its cause.
         """
         if not isinstance(x, Tensor):
             raise TypeError(f"x must be a tensor [K, {self.n}], got {type(x).__name__}")
@@ -200,14 +202,12 @@ class MitsubaScene:
         with self._lock:
             self._calls += self.noise == "call"
             seed = self._fresh()
-        images = [self._image(point, seed) for point in points]
-        if self.loss is None:
-            out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32, device="cpu")
-        else:
+        found = [self._image(point, seed) for point in points]
+        if self.loss is not None:
             with torch.no_grad():
-                losses = [_number(self.loss(image)) for image in images]
-            out = (torch.stack(losses) if losses else torch.empty(0, device="cpu")).to(x.dtype)
-        return out.to(x.device)
+                found = [_number(self.loss(image)).to(x.dtype) for image in found]
+        none = torch.empty(0, dtype=torch.float32 if self.loss is None else x.dtype, device="cpu")
+        return (torch.stack(found) if found else none).to(x.device)
 
     def set(self, x: Tensor) -> None:
         """Give the scene the parameters x [n], clamped to the bounds, for renders of one's own.
@@ -254,7 +254,7 @@ class MitsubaScene:
             views = []
             for number, sensor in enumerate(self._sensors):
                 own = (seed + number * _APART) % _MOST
-                pixels = self.mi.render(self.scene, sensor=sensor, integrator=self.integrator, seed=own, **more)
+                pixels = rendered(self.mi, self.scene, sensor=sensor, integrator=self.integrator, seed=own, **more)
                 views.append(np.array(pixels, dtype=np.float32))
         image = np.stack(views) if self._several else views[0]
         if self.nan == "raise" and not np.isfinite(image).all():

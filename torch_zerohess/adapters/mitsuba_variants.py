@@ -159,7 +159,8 @@ def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleT
     elif variant != "scalar_rgb":
         outcome = _try(variant)
         if not outcome.works:
-            raise RuntimeError(f"variant {variant!r} does not work here: {outcome.reason}; {_advice(variant)}")
+            advice = "take one of these" if "unsupported variant" in outcome.reason else _advice(variant)
+            raise RuntimeError(f"variant {variant!r} does not work here: {outcome.reason.rstrip('.')}; {advice}")
     llvm = find_llvm()
     if llvm is not None:  # read once, when Dr.Jit first needs LLVM
         asked = os.environ.get("DRJIT_LIBLLVM_PATH")

@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import copy
+import gc
 import math
 import pickle
 import threading
@@ -704,3 +705,40 @@ def test_a_scene_says_what_it_is(variant) -> None:
     settings = f"film=(5, 3), spp=2, noise='fixed', variant='{variant}'"
     assert repr(scene) == f"MitsubaScene(n={scene.n}, parameters=[{', '.join(scene.labels)}], {settings})"
     assert scene.n <= 4
+
+
+def colours(texture, light):
+    """A function that describes a ball with a texture under a light."""
+
+    def described(mi):
+        made = {**texture, "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))} if "raw" in texture else texture
+        ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": made}}
+        own = {"type": "constant", "radiance": light}
+        return {"type": "scene", "integrator": {"type": "path"}, "sensor": camera(mi), "ball": ball, "light": own}
+
+    return described
+
+
+RAW, BODY = {"type": "bitmap", "raw": True}, {"type": "blackbody", "temperature": 5000.0}
+REFUSED = [
+    ("spectral", colours(RAW, {"type": "d65"}), r"explicitly disabled! \(raw=true\); leave \"raw\" out"),
+    ("rgb", colours(rgb(0.5, 0.5, 0.5), BODY), r"Not implemented for non-spectral modes; a spectrum .* variant of spectra"),
+]
+
+
+@pytest.mark.parametrize("kind", ["scalar", "llvm_ad"])
+@pytest.mark.parametrize(("colour", "description", "message"), REFUSED, ids=["raw texture", "spectrum"])
+def test_a_render_that_mitsuba_refuses_has_the_cause(kind, colour, description, message):
+    """Just-in-time variants say no more than "see above"."""
+    if kind == "llvm_ad" and "llvm_ad_rgb" not in VARIANTS:
+        pytest.skip("no LLVM that is new enough")
+    name = f"{kind}_{colour}"
+    scene = MitsubaScene(description, [Transform("ball.to_world", move=((1, 0, 0),))], film=(2, 2), variant=name)
+    with pytest.raises(RuntimeError, match=rf"cannot render the scene with variant '{name}': .*{message}") as caught:
+        scene(scene.x0[None])
+    assert ("it may be in another scene" in str(caught.value)) == (kind == "llvm_ad")
+    assert "see above" not in str(caught.value)
+    del scene, caught
+    gc.collect()
+    sound = MitsubaScene(colours(rgb(0.5, 0.5, 0.5), rgb(1.0, 1.0, 1.0)), [Value("ball.bsdf.reflectance.value")])
+    assert sound(sound.x0[None]).isfinite().all()

@@ -16,13 +16,14 @@ from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.minimization.callback import Callback
 from torch_zerohess.minimization.evaluating import evaluating
+from torch_zerohess.minimization.known import Known
 from torch_zerohess.minimization.loop import run
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation
 from torch_zerohess.minimization.outcome import outcome
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping
-from torch_zerohess.search.protocol.space import Bounds, Vector, checked_start
+from torch_zerohess.search.protocol.space import Bounds, Space, Vector, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.surrogates.memory import Memory, check_memory
@@ -71,6 +72,7 @@ def minimize(
     restarts: int | None = None,
     noise: float | None = None,
     memory: Memory | None = None,
+    known: tuple[Any, Any] | None = None,
     **settings: Any,
 ) -> Minimum:
     """Minimise fn from x0 with `optim.TrustRegion`.
@@ -149,6 +151,13 @@ def minimize(
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`
             measures how well a surrogate of the evaluations predicts, and later ones use the surrogate.
+        known: evaluations of fn that there are already, in any order: points [m, n] and what fn returned for them, [m],
+            or [m, *out] with `loss`. They may be (fit.points, fit.values) of a fit, or with `loss` (memory.points,
+            memory.outputs). The search begins with all of them. They do not count as evaluations, and the best of them
+            may be `x`. Make it x0: a start that is not among them is evaluated first. If n points beside x0 have a
+            value, no samples around x0 are evaluated, so some should lie within a few sigma of it. Without `noise` the
+            value at x0 is compared with a new one. NaN stands for a point that has failed. Where a `checkpoint` goes
+            on, give the same points or None. ValueError for points outside of the bounds.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Raises ValueError for an argument out of range, TypeError for one of another type or an unknown name.
@@ -185,10 +194,15 @@ def minimize(
         return TrustRegion(start if at is None else at, sigma=sigma, bounds=bounds, noise=noise, seed=seed, **given)
 
     smallest = len(make(noise or 0.0).ask()) + 1
+    space = Space.checked(start, sigma, bounds)
+    had = None if known is None else Known.checked(known, space, scalar=loss is None)
+    enough = had is not None and had.suffice
+    smallest = 2 if enough else smallest
     if max_evaluations < smallest:
+        first = "the start" if enough else "the start, its samples"
         raise ValueError(
-            f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(start)} "
-            f"parameters, got {max_evaluations}"
+            f"max_evaluations must be at least {smallest}, {first} and one step with {len(start)} parameters, got "
+            f"{max_evaluations}"
         )
     noise = None if noise is None else float(noise)  # the file has plain numbers
     tolerance = settings.get("tolerance")
@@ -200,7 +214,7 @@ def minimize(
     black_box = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
     call = separated(evaluating(black_box, memory, scalar=loss is None), black_box.separates)
     noted = None if callback is None else Callback(callback)
-    running = Running(make, call, noise, batch, smallest, max_evaluations, path, limits, noted, verbose=verbose)
+    running = Running(make, call, noise, batch, smallest, max_evaluations, path, limits, noted, had, verbose=verbose)
     try:
         end = run(running, stopping, noted, "fn" if loss is None else "fn or loss")
     finally:

@@ -117,7 +117,7 @@ class Estimate:
         standard errors. With baseline "mean" the draws depend on each other, and the error is by the jackknife.
 
         Args:
-            quantity: "value" (of the estimate of F(x), also where `value` is f(x)), "gradient", "hessian_diagonal", "hessian" or "hvp".
+            quantity: "value" (of F(x), also where `value` is f(x)), "gradient", "hessian_diagonal", "hessian" or "hvp".
             v: the vector of the "hvp", [*batch, n] or [n].
 
         Raises:
@@ -228,8 +228,8 @@ class Estimate:
 
     def _once(self, name: str, make: Callable[[], Tensor]) -> Tensor:
         """Make a tensor once. What a transform of torch or inference mode makes is not kept: it serves nothing else."""
-        result = self._made.get(name)
-        if result is None and readable(result := make()) and not result.is_inference():
+        result = self._made[name] if name in self._made else make()
+        if readable(result) and not result.is_inference():
             self._made[name] = result
         return result
 

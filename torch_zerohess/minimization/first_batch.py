@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.minimization.noise import REPEATED, deviation, differs, is_rounding
 from torch_zerohess.minimization.record import Record
 from torch_zerohess.search.trust_region import TrustRegion
@@ -34,15 +35,20 @@ def evaluate_first_batch(
     values = record.values(every)
     if not differs(values[0], values[-1]):
         again = search.losses(values[-1:])  # it may raise: the search is not told before
-        search.tell(values[:-1])
+        tell(search, values[:-1], points, record)
         return 0.0, search, every, torch.cat([search.told, again])
-    count = max(min(REPEATED - 2, most - len(every)), known, 0)
+    count = max(min(REPEATED - 2, most + len(record.given) - len(every)), known, 0)
     every = torch.cat([every, start.repeat(count, 1)])
     values = record.values(every)
     losses = search.losses(values)
     if is_rounding(torch.cat([values[:1], values[len(points) :]])):
-        search.tell(values[: len(points)])
+        tell(search, values[: len(points)], points, record)
         return 0.0, search, every, torch.cat([search.told, losses[len(points) :]])
+    again = values[len(points) :]
+    if 0 in record.given and len(again) > 2 and not any(differs(one, again[0]) for one in again):
+        raise ReturnedValueError(
+            f"known must have values of fn, but at x0 it has one that differs from {len(again)} new ones, which agree"
+        )
     noise = deviation(torch.cat([losses[:1], losses[len(points) :]]))
     search = make(noise)
     if torch.equal(search.ask(max(batch - 1, 1), limit=len(points)), points):
@@ -50,3 +56,11 @@ def evaluate_first_batch(
     else:
         search.tell_at(values, every)
     return noise, search, every, losses
+
+
+def tell(search: TrustRegion, values: Tensor, points: Tensor, record: Record) -> None:
+    """Tell a search the values [K, *out] of the points [K, n] of a request, some of which the caller may have had."""
+    if record.opening:
+        search.tell_at(values, points)
+    else:
+        search.tell(values)

@@ -61,7 +61,7 @@ class Minimum:
             2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.
         sigma: [n], width of the quadratic along every parameter; in noise, the mean distance from x of the evaluations
             that the derivatives were fitted to.
-        evaluations: how many there were.
+        evaluations: how many there were, without those that were `known` before.
         points: [evaluations, n], where, in order.
         values: [evaluations], float64, the losses there; NaN where an output is not finite.
         history: `points` and `values` as a list of `Observation`.

@@ -13,6 +13,7 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
     """Return the result of a search that has ended with a status, or so far, and what the message says of it."""
     search = running.search
     (x, value, error), (points, losses) = running.best, running.record.told
+    own = running.record.own
     around = quadratic_at(x, search, points, losses, running.noise or 0.0)
     begun = search.evaluations > 0  # a start whose value it cannot take says nothing of sigma
     equal = running.evaluations if begun and running.record.flat and len(search.unit) < running.evaluations else 0
@@ -22,8 +23,8 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
         value=value,
         **around._asdict(),
         evaluations=running.evaluations,
-        points=points,
-        values=losses,
+        points=points[own],
+        values=losses[own],
         message=worded(
             message,
             status,
@@ -34,7 +35,7 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
             success=success,
             flat=not running.noise and search.untouched is None and is_flat(around, search.unit),
             measuring=running.needed_for_noise,
-            failed=int((~torch.isfinite(losses)).sum()),
+            failed=int((~torch.isfinite(losses[own])).sum()),
             same_outputs=running.record.same_outputs,
         ),
         engine=search.engine,

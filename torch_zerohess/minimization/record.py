@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
+from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.evaluators.single_nan import alike
+from torch_zerohess.minimization.known import Known
 from torch_zerohess.minimization.minimality_checks import DEEP, is_unbounded
 
 _HELD = 1 << 22
@@ -46,6 +48,10 @@ class Record:
         """The first output [*out]."""
         self._same = True
         """Whether all outputs are known to be equal to it."""
+        self.given: list[int] = []
+        """Numbers of the evaluations that the caller had before, all of them in the first request."""
+        self.opening = 0
+        """Points of the first request, while it is open, if the caller had some of them; otherwise 0."""
 
     @property
     def known(self) -> int:
@@ -70,6 +76,37 @@ class Record:
         return self.complete + (len(self._interrupted[1]) if self._numbers else 0)
 
     @property
+    def made(self) -> int:
+        """Number of these evaluations that were made here."""
+        return max(self.evaluations - len(self.given), 0)
+
+    @property
+    def own(self) -> Tensor:
+        """Which of `told` were evaluated here, bools [evaluations]."""
+        losses = self.told[1]
+        own = torch.ones_like(losses, dtype=torch.bool)
+        if len(losses):
+            own[self._places] = False
+        return own
+
+    @property
+    def _places(self) -> list[int]:
+        """Where in `told` the evaluations are that the caller had."""
+        if self.complete:
+            return self.given
+        return [k for k, number in enumerate(sorted(self._numbers)) if number in self.given]
+
+    def open(self, asked: Tensor, known: Known) -> Tensor:
+        """Open the first request: points [K, n], the start first, and those that are known. Return all of them."""
+        first = int(known.has_start)
+        asked = asked[:1] if known.suffice else asked
+        self.requested = points = torch.cat([asked, known.points[first:]])
+        self.given, self.opening = [*range(first), *range(len(asked), len(points))], len(points)
+        self._numbers, self._values, self._open = list(self.given), known.values, None
+        self._note_outputs(known.values)
+        return points
+
+    @property
     def _interrupted(self) -> tuple[Tensor, Tensor]:
         """Points [k, n] and losses [k] of the request, whose values are known; none if the loss raises."""
         if self._open is None:
@@ -90,28 +127,47 @@ class Record:
             numbers, values, error = self._call(points[missing])
             if numbers:
                 values = alike([*(one for one in self._outputs[-1:] if len(one)), values])[-1]
-                self._first = values[0].clone() if self._first is None else self._first
-                self._same = (
-                    self._same and values.shape[1:] == self._first.shape and bool((values == self._first).all())
-                )
-                self._values = torch.cat(alike([self._values, values])) if self._numbers else values
+                self._note_outputs(values)
+                self._values = self._with(values) if self._numbers else values
                 self._numbers += [missing[k] for k in numbers]
             if error is not None:
                 raise error
         return self._sorted()[: len(points)]
 
+    def _note_outputs(self, values: Tensor) -> None:
+        """Note the first output, and whether values [k, *out] are all equal to it."""
+        self._first = values[0].clone() if self._first is None else self._first
+        self._same = self._same and values.shape[1:] == self._first.shape and bool((values == self._first).all())
+
+    def _with(self, values: Tensor) -> Tensor:
+        """Return the values of the request with further ones [k, *out]. ValueError if their outputs have other shapes.
+
+        Numbers [k] and a column [k, 1] are the same.
+        """
+        before, values = alike([self._values, values])
+        before = before[:, None] if before.ndim == 1 and values.shape[1:] == (1,) else before
+        if before.shape[1:] != values.shape[1:]:
+            shapes = f"{list(before.shape[1:])} before, or in known, and {list(values.shape[1:])} now"
+            raise ReturnedValueError(
+                f"fn must return values of one shape, and known must have this shape, got {shapes}"
+            )
+        return torch.cat([before, values])
+
     def note(self, points: Tensor, losses: Tensor) -> None:
         """Add points [K, n] and losses [K] to the record, and close the request."""
         self._outputs = self._with_outputs(len(points))
-        self.last = points, losses
-        self._batches.append(self.last)
-        self.complete += len(points)
+        self._batches.append((points, losses))
+        own = [k for k in range(len(points)) if self.complete or k not in self.given]
+        self.last = points[own], losses[own]
+        self.complete, self.opening = self.complete + len(points), 0
         self.requested, self._numbers, self._values = None, [], self._values[:0]
 
     def note_known(self) -> None:
         """Add the known values of the request, and close it."""
-        if self.requested is not None:
-            self.note(*self._interrupted)
+        if self.requested is None:
+            return
+        self.given = self._places  # the points that have no value are left out
+        self.note(*self._interrupted)
 
     def keeping(self, untouched: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return `told`, with the loss NaN wherever an untouched parameter, bools [n], differs from x [n]."""
@@ -164,21 +220,29 @@ class Record:
         """Everything, for `load_state_dict`."""
         points, losses = _joined(self._batches)
         request = None if self.requested is None else (self.requested, list(self._numbers), self._values)
-        return {"points": points, "values": losses, "request": request, "outputs": torch.cat(self._outputs)}
+        own = {"points": points, "values": losses, "request": request, "outputs": torch.cat(self._outputs)}
+        return own | ({"given": list(self.given), "opening": self.opening} if self.given else {})
 
-    def load_state_dict(self, state: dict[str, Any], like: Tensor) -> None:
-        """Go on from a state, on the device of the start `like` [n]. ValueError if it has another start or type."""
+    def load_state_dict(self, state: dict[str, Any], like: Tensor, known: Known | None = None) -> None:
+        """Go on from a state, on the device of the start `like` [n].
+
+        ValueError if it has another start or type, or began with other points than those that are `known`, if any.
+        """
         points, losses = state["points"], state["values"]
         if points.dtype != like.dtype:
             raise ValueError(f"x0 must be {points.dtype} as there, got {like.dtype}")
         if points.shape[1:] == like.shape and len(points) and not torch.equal(points[0].to(like.device), like):
             raise ValueError(f"x0 must be {short(points[0])} as there, got {short(like)}")
         self._same = not len(points)
+        self.given, self.opening = state.get("given", []), state.get("opening", 0)
         self._batches, self.complete = [(points.to(like.device), losses.to(like.device))], len(points)
         self._outputs = [state["outputs"].to(like.device)]
         if state["request"] is not None:
             requested, self._numbers, values = state["request"]
             self.requested, self._values = requested.to(like.device), values.to(like.device)
+        if known is not None:
+            began = self._batches[0][0] if self.complete or self.requested is None else self.requested
+            known.check_same(began[self.given])
 
     def _sorted(self) -> Tensor:
         """The values that are known [k, *out], in the order of their points."""

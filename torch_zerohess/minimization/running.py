@@ -1,6 +1,5 @@
 """A search that goes on: its evaluations, noise, history, and file."""
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,18 +11,20 @@ from torch import Tensor
 from torch_zerohess.arguments import check_state
 from torch_zerohess.minimization.checkpoint import Checkpoint, check_limits
 from torch_zerohess.minimization.decision import Decision, decide
-from torch_zerohess.minimization.first_batch import evaluate_first_batch
+from torch_zerohess.minimization.first_batch import evaluate_first_batch, tell
+from torch_zerohess.minimization.known import Known
 from torch_zerohess.minimization.minimality_checks import doubt
 from torch_zerohess.minimization.minimum import Iterate
 from torch_zerohess.minimization.noise import REPEATED, noise_at, opening, reserved
 from torch_zerohess.minimization.noisy_minimum import Lowest, expected_minimum, lowest
 from torch_zerohess.minimization.record import Call, Record
+from torch_zerohess.minimization.reporting import Reporting
 from torch_zerohess.minimization.wording import budget
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.version import VERSION
 
 _PAUSE = 1.0
-"""Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
+"""Seconds between two writes of a checkpoint."""
 _LUCK = 2.0
 """Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 
@@ -41,6 +42,7 @@ class Running:
         path: of the file, or None.
         limits: settings by name that end the search by itself, as the caller gave them.
         noted: called after every batch, with what it has led to; or None.
+        known: evaluations that the caller has; or None.
         verbose: whether to write a line to stderr every second, and one at the end.
     """
 
@@ -55,19 +57,20 @@ class Running:
         path: Path | None,
         limits: Mapping[str, float | None],
         noted: Callable[[Iterate], None] | None,
+        known: Known | None,
         *,
         verbose: bool,
     ) -> None:
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._batch, self._least, self._most = make, batch, least, most
-        self._limits, self._then = dict(limits), noted
-        self._file, self._verbose = None if path is None else Checkpoint(path), verbose
+        self._limits, self._then, self._known = dict(limits), noted, known
+        self._file, self._reporting = None if path is None else Checkpoint(path), Reporting(verbose=verbose)
         self._sure = noise is not None
         """Whether the noise needs no second look: the caller gave it, or x was evaluated again."""
         self._unmeasured = False
         """Whether the evaluations were too few to measure noise."""
-        self._begun = self._written = self._said = time.monotonic()
+        self._begun = self._written = time.monotonic()
         self._decided: Decision | None = None
         self._deciding: tuple[int, int] | None = None
         """Evaluations before the decision that is being made, and those that it gets."""
@@ -92,8 +95,8 @@ class Running:
 
     @property
     def evaluations(self) -> int:
-        """Evaluations so far, including the measurement of noise and the finished part of an interrupted batch."""
-        return self.record.evaluations
+        """Evaluations made so far, including the measurement of noise and the finished part of an interrupted batch."""
+        return self.record.made
 
     @property
     def spent(self) -> bool:
@@ -125,7 +128,7 @@ class Running:
         search = self.search
         points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
-            return self._expected_minimum(self.evaluations)
+            return self._expected_minimum(self.record.evaluations)
         found = lowest(points, losses, search.x)
         of_search = search.evaluations and self.record.requested is None and not self.record.flat
         # What the search takes for the best may be a prediction, where fn varies as if it was noisy.
@@ -134,7 +137,7 @@ class Running:
     @property
     def decision(self) -> Decision | None:
         """The decision, unless the search has gone on since."""
-        return self._decided if self._decided and self._decided.evaluations == self.evaluations else None
+        return self._decided if self._decided and self._decided.evaluations == self.record.evaluations else None
 
     @property
     def needed_for_noise(self) -> int:
@@ -154,12 +157,13 @@ class Running:
         """
         search, points, self._deciding = self.search, self.record.requested, None
         if points is None:
-            measured = self.noise is None and self.left > len(search.ask()) + 1
+            measured = self.noise is None and self.left > self._least
             self._unmeasured = self._unmeasured or (self.noise is None and not measured)
             limit = opening(self._batch, len(search.ask()), self.left) if measured else self.left
             points = search.ask(min(max(self._batch - int(measured), 1), limit), limit=limit)
+            points = points if self.begun or self._known is None else self.record.open(points, self._known)
         else:
-            measured, points = self.noise is None, points[: len(search.missing)]
+            measured, points = self.noise is None, points[: self.record.opening or len(search.missing)]
         if measured:
             most = self._most - self._least
             found = evaluate_first_batch(points, self.record, search, self._again, self._batch, most)
@@ -173,7 +177,7 @@ class Running:
         lost = self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0]))
         if lost:
             values = torch.cat([self.record.mean_at(points[0])[None].to(values), values[1:]])
-        search.tell(values)
+        tell(search, values, points, self.record)
         self._noted(points, values.to(search.told) if lost else search.told)
 
     def look_again(self, *, at_target: bool = False) -> bool:
@@ -188,7 +192,7 @@ class Running:
         ends = self.left <= few and self.search.evaluations >= self._least
         if not (at_target or self.search.solved or self.search.done or ends or self._looking is not None):
             return False
-        self._looking = self.evaluations if self._looking is None else self._looking
+        self._looking = self.record.evaluations if self._looking is None else self._looking
         found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)
         if found:
             self.noise, self.search = found, self._again(found, self.best.x)
@@ -213,10 +217,10 @@ class Running:
         if not self.noise or not self.begun or self.decision is not None:
             return
         self.record.note_known()
-        before, most = self._deciding or (self.evaluations, 0)
-        allowed = min(reserved(self._most), self._most - before)
+        before, most = self._deciding or (self.record.evaluations, 0)
+        allowed = min(reserved(self._most), self._most + len(self.record.given) - before)
         if most != allowed:  # there is none to go on with
-            before, allowed = self.evaluations, min(reserved(self._most), self._most - self.evaluations)
+            before, allowed = self.record.evaluations, min(reserved(self._most), self._most - self.evaluations)
         if allowed < 1:
             return
         self._deciding = before, allowed
@@ -224,7 +228,7 @@ class Running:
         likely = [search.x, search.center, expected] if search.averages else [expected, search.center]
         found = decide(self._evaluated, self.record, search, likely, before, allowed, self.noise)
         if found is not None:
-            self._decided = Decision(*found, self.evaluations)
+            self._decided = Decision(*found, self.record.evaluations)
         self._deciding = None
 
     def write(self) -> None:
@@ -244,7 +248,7 @@ class Running:
         given, before = self.noise, saved["noise"]
         self.noise = given if given and before else before  # noise of another size is no other search
         self.search = self._make(self.noise or 0.0)
-        self.record.load_state_dict(saved, x := self.search.x)
+        self.record.load_state_dict(saved, x := self.search.x, self._known)
         self.search.load_state_dict(saved["search"])
         self._deciding, self._looking = saved["deciding"], saved["looking"]
         if saved["decided"] is not None:
@@ -283,18 +287,14 @@ class Running:
     def _noted(self, points: Tensor, losses: Tensor) -> None:
         """Add a batch at points [K, n] with losses [K] to the record, and write it where it is due."""
         self.record.note(points, losses)
-        now = time.monotonic()
-        if self._verbose and now - self._said >= _PAUSE:
-            self._said = now
+        if self._reporting.due:
             self.say()
-        if now - self._written >= _PAUSE:
+        if time.monotonic() - self._written >= _PAUSE:
             self.write()
         if self._then is not None:
             self._then(self.iterate)
 
     def say(self) -> None:
         """Write a line on how far the search is to stderr, if it is `verbose`."""
-        if not self._verbose:
-            return
-        said = f"{self.evaluations} evaluations, value {self.best.value:.6g}, sigma / its start {self.search.sigma:.3g}"
-        print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
+        if self._reporting.verbose:
+            self._reporting.say(self.evaluations, self.best.value, self.search.sigma, self.seconds)

@@ -722,7 +722,11 @@ def colours(texture, light):
 RAW, BODY = {"type": "bitmap", "raw": True}, {"type": "blackbody", "temperature": 5000.0}
 REFUSED = [
     ("spectral", colours(RAW, {"type": "d65"}), r"explicitly disabled! \(raw=true\); leave \"raw\" out"),
-    ("rgb", colours(rgb(0.5, 0.5, 0.5), BODY), r"Not implemented for non-spectral modes; a spectrum .* variant of spectra"),
+    (
+        "rgb",
+        colours(rgb(0.5, 0.5, 0.5), BODY),
+        r"Not implemented for non-spectral modes; a spectrum .* variant of spectra",
+    ),
 ]
 
 

@@ -52,7 +52,8 @@ def test_the_last_sigma_is_that_of_every_layer():
         schedule.step()
     each = zh.LinearSigma(layers, vector(1.0, 2.0), 0.5, steps=2)
     each.get_last_sigma()[0].zero_()  # it is the caller's
-    assert torch.equal(each.sigma, vector(1.0, 2.0)) and torch.equal(layers[0].smoothing.sigma, vector(1.0, 2.0))
+    assert torch.equal(each.sigma, vector(1.0, 2.0))
+    assert torch.equal(layers[0].smoothing.sigma, vector(1.0, 2.0))
 
 
 def test_one_sigma_per_parameter():

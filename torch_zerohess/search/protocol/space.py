@@ -69,20 +69,23 @@ class Space:
                     f"state must be of a search with {name} bounds {own.tolist()}, got {state[name].tolist()}"
                 )
 
-    def checked_points(self, points: Any) -> Tensor:
+    def checked_points(self, points: Any, name: str = "points") -> Tensor:
         """Return points [K, n] of the caller's as a tensor. ValueError if a search could not have asked for them."""
         n = len(self.start)
         try:
             points = torch.as_tensor(points, device=self.unit.device).double()
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"points must be numbers [K, {n}], got {reprlib.repr(points)}") from error
+            raise ValueError(f"{name} must be numbers [K, {n}], got {reprlib.repr(points)}") from error
         if points.ndim != 2 or points.shape[1] != n or not len(points):
-            raise ValueError(f"points must have shape [K, {n}], got {list(points.shape)}")
-        wrong = ~((points >= self.lower) & (points <= self.upper) & torch.isfinite(points)).all(1)
+            raise ValueError(f"{name} must have shape [K, {n}], got {list(points.shape)}")
+        lower, upper, infinite = self.lower, self.upper, torch.full_like(self.upper, math.inf)
+        if lower.dtype == torch.float32:  # the bound 0.3 is no number of float32, and may be a point of float64
+            lower, upper = lower.nextafter(-infinite), upper.nextafter(infinite)
+        wrong = ~((points >= lower) & (points <= upper) & torch.isfinite(points)).all(1)
         if bool(wrong.any()):
             k = int(wrong.nonzero()[0])
-            raise ValueError(f"points must be finite and within the bounds, got {points[k].tolist()} for point {k}")
-        return points.detach()
+            raise ValueError(f"{name} must be finite and within the bounds, got {points[k].tolist()} for point {k}")
+        return points.detach().clamp(self.lower.double(), self.upper.double())
 
     def start_first(self, points: Tensor) -> Tensor:
         """Return the order [K] of points [K, n] in which the start is the first. ValueError if it is none of them."""

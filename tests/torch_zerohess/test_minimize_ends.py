@@ -387,7 +387,7 @@ def test_a_checkpoint_goes_on_where_it_was(tmp_path):
 
 
 def test_verbose_says_how_far_it_is(monkeypatch, capsys):
-    monkeypatch.setattr("torch_zerohess.minimization.running._PAUSE", 0.0)
+    monkeypatch.setattr("torch_zerohess.minimization.report._PAUSE", 0.0)
     zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=10, verbose=True)
     assert "10 evaluations, value " in capsys.readouterr().err
 

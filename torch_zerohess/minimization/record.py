@@ -55,8 +55,9 @@ class Record:
 
     @property
     def known(self) -> int:
-        """How far the request has got: the number after the last point that has a value."""
-        return max(self._numbers, default=-1) + 1
+        """How far the request has got: the number after the last point that was evaluated."""
+        had = () if self.complete else self.given
+        return max((number for number in self._numbers if number not in had), default=-1) + 1
 
     @property
     def due(self) -> int:

@@ -18,7 +18,7 @@ from torch_zerohess.minimization.minimum import Iterate
 from torch_zerohess.minimization.noise import REPEATED, noise_at, opening, reserved
 from torch_zerohess.minimization.noisy_minimum import Lowest, expected_minimum, lowest
 from torch_zerohess.minimization.record import Call, Record
-from torch_zerohess.minimization.reporting import Reporting
+from torch_zerohess.minimization.report import Report
 from torch_zerohess.minimization.wording import budget
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.version import VERSION
@@ -65,12 +65,12 @@ class Running:
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._batch, self._least, self._most = make, batch, least, most
         self._limits, self._then, self._known = dict(limits), noted, known
-        self._file, self._reporting = None if path is None else Checkpoint(path), Reporting(verbose=verbose)
         self._sure = noise is not None
         """Whether the noise needs no second look: the caller gave it, or x was evaluated again."""
         self._unmeasured = False
         """Whether the evaluations were too few to measure noise."""
         self._begun = self._written = time.monotonic()
+        self._file, self._report = None if path is None else Checkpoint(path), Report(self._begun, verbose=verbose)
         self._decided: Decision | None = None
         self._deciding: tuple[int, int] | None = None
         """Evaluations before the decision that is being made, and those that it gets."""
@@ -287,14 +287,14 @@ class Running:
     def _noted(self, points: Tensor, losses: Tensor) -> None:
         """Add a batch at points [K, n] with losses [K] to the record, and write it where it is due."""
         self.record.note(points, losses)
-        if self._reporting.due:
+        if self._report.due(now := time.monotonic()):
             self.say()
-        if time.monotonic() - self._written >= _PAUSE:
+        if now - self._written >= _PAUSE:
             self.write()
         if self._then is not None:
             self._then(self.iterate)
 
     def say(self) -> None:
         """Write a line on how far the search is to stderr, if it is `verbose`."""
-        if self._reporting.verbose:
-            self._reporting.say(self.evaluations, self.best.value, self.search.sigma, self.seconds)
+        if self._report.verbose:
+            self._report.say(self.evaluations, self.best.value, self.search.sigma, self.seconds)

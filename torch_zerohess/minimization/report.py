@@ -1,27 +1,27 @@
 """Lines on how far a search is, to stderr."""
 
 import sys
-import time
 
 _PAUSE = 1.0
 """Seconds between two lines."""
 
 
-class Reporting:
-    """Lines of a search that is `verbose`; otherwise none."""
+class Report:
+    """Lines of a search that began at a time in seconds, if it is `verbose`."""
 
-    def __init__(self, *, verbose: bool) -> None:
+    def __init__(self, begun: float, *, verbose: bool) -> None:
         self.verbose = verbose
         """Whether there are lines."""
-        self._said = time.monotonic()
+        self._said = begun
 
-    @property
-    def due(self) -> bool:
-        """Whether the last line was a second ago."""
-        return self.verbose and time.monotonic() - self._said >= _PAUSE
+    def due(self, now: float) -> bool:
+        """Return whether a line is due at a time: a second after the last one that was due."""
+        if not self.verbose or now - self._said < _PAUSE:
+            return False
+        self._said = now
+        return True
 
     def say(self, evaluations: int, value: float, sigma: float, seconds: float) -> None:
         """Write a line."""
-        self._said = time.monotonic()
         said = f"{evaluations} evaluations, value {value:.6g}, sigma / its start {sigma:.3g}, {seconds:.0f} s"
         print(said, file=sys.stderr, flush=True)

@@ -56,7 +56,7 @@ class Record:
     @property
     def known(self) -> int:
         """How far the request has got: the number after the last point that was evaluated."""
-        had = () if self.complete else self.given
+        had = set() if self.complete else set(self.given)
         return max((number for number in self._numbers if number not in had), default=-1) + 1
 
     @property
@@ -95,7 +95,8 @@ class Record:
         """Where in `told` the evaluations are that the caller had."""
         if self.complete:
             return self.given
-        return [k for k, number in enumerate(sorted(self._numbers)) if number in self.given]
+        given = set(self.given)
+        return [k for k, number in enumerate(sorted(self._numbers)) if number in given]
 
     def open(self, asked: Tensor, known: Known) -> Tensor:
         """Open the first request: points [K, n], the start first, and those that are known. Return all of them."""
@@ -123,7 +124,8 @@ class Record:
         The request stays open until `note`. Further points may be added to it.
         """
         self.requested, self._open = points, None
-        missing = [k for k in range(len(points)) if k not in self._numbers]
+        had = set(self._numbers)
+        missing = [k for k in range(len(points)) if k not in had]
         if missing:
             numbers, values, error = self._call(points[missing])
             if numbers:
@@ -158,7 +160,8 @@ class Record:
         """Add points [K, n] and losses [K] to the record, and close the request."""
         self._outputs = self._with_outputs(len(points))
         self._batches.append((points, losses))
-        own = [k for k in range(len(points)) if self.complete or k not in self.given]
+        given = set() if self.complete else set(self.given)
+        own = [k for k in range(len(points)) if k not in given]
         self.last = points[own], losses[own]
         self.complete, self.opening = self.complete + len(points), 0
         self.requested, self._numbers, self._values = None, [], self._values[:0]

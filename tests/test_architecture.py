@@ -17,6 +17,7 @@ LAYERS = {
             "version",
             "arguments",
             "precision",
+            "threads",
             "wrappers",
             "evaluation_mode",
             "choice",

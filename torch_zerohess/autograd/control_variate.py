@@ -12,8 +12,8 @@ from torch_zerohess.autograd.closed_squares import losses
 from torch_zerohess.estimation.control import NOT_FINITE, Control, Prediction
 from torch_zerohess.estimation.inputs import all_finite
 from torch_zerohess.estimation.smoothness import known_smooth
-from torch_zerohess.estimation.surrogate_mean import per_element, smoothed
-from torch_zerohess.estimation.surrogate_term import MOST_STEIN, measure
+from torch_zerohess.estimation.surrogate_mean import smoothed
+from torch_zerohess.estimation.surrogate_term import MOST_STEIN, measure, point_count
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
@@ -134,7 +134,7 @@ class Around:
         excess = predicted.excess(sigma) if control.outer.linear else None
         if excess is None:
             pathwise = _pathwise(control, center, self.aux, sigma, self.order, self.seed)
-            u = self.nodes(per_element(control.memory.draws, center.shape[1], len(center), pathwise=pathwise))
+            u = self.nodes(point_count(control, len(center), center.shape[1], pathwise))
         else:  # the mean over all points is known from the center
             u, pathwise = sigma.new_zeros(1, 1, len(sigma)), 2
         if not len(part):

@@ -35,6 +35,8 @@ _ROUNDING, _DEVIATION = 16.0, 0.01
 
 
 NOT_FINITE = "the surrogate of the memory predicted a value that is not finite"
+_LARGE = 256
+"""Numbers of an output beyond which a head of the caller's takes most of the time of a prediction."""
 _PLAIN = (torch.jit.ScriptModule, nn.DataParallel)
 """Modules whose parameters cannot be exchanged for a call."""
 _changed = threading.RLock()
@@ -66,6 +68,12 @@ class Control:
         if memory.fresh == 0 and not memory.ready:
             raise ValueError("memory with fresh=0 has no surrogate yet: add evaluations and call memory.fit()")
         return cls(memory, outer, c > 0.0, c, learning, memory.evaluations)
+
+    @property
+    def costly(self) -> bool:
+        """Whether a head of the caller's goes through all numbers of a large output."""
+        head, shape = self.outer.head, self.memory.output_shape
+        return head is not None and type(head) is not SquaredError and shape is not None and shape.numel() > _LARGE
 
     def parted(self, aux: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor], Tensor | None]:
         """Return the auxiliary inputs of the head, `Prediction.encoded` of them, and the scales [B, 2] if any.

@@ -25,6 +25,9 @@ _POINTS = 1024
 """Points of a call with few parameters, over all elements of its batch."""
 _FEWEST = 64
 """Points per element at least."""
+_COSTLY_POINTS, _COSTLY_FEWEST = 256, 32
+"""The same where a point takes long and derivatives are along the points. New evaluations are far fewer, and their
+errors larger."""
 _FEW = 32
 """Parameters that are few."""
 _PAIRS = 2
@@ -39,15 +42,19 @@ def _even(count: int, n: int) -> Tensor:
     return torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(count, dtype=torch.float64)
 
 
-def per_element(draws: int | None, n: int, batch: int, *, pathwise: int) -> int:
+def per_element(draws: int | None, n: int, batch: int, *, pathwise: int, costly: bool = False) -> int:
     """Return how many points an element has: `draws` of the memory.
 
     Without it they are 1024 / batch and at least 64 up to 32 parameters. For more parameters they are 4 if all
-    derivatives are pathwise, and 64 if not.
+    derivatives are pathwise, and 64 if not. If a point is costly and any derivative is pathwise, they are 256 / batch
+    and at least 32 up to 32 parameters.
     """
     if draws is not None:
         return draws
-    return max(_POINTS // max(batch, 1), _FEWEST) if n <= _FEW else 2 * _PAIRS if pathwise == 2 else _FEWEST
+    if n > _FEW:
+        return 2 * _PAIRS if pathwise == 2 else _FEWEST
+    points, fewest = (_COSTLY_POINTS, _COSTLY_FEWEST) if costly and pathwise else (_POINTS, _FEWEST)
+    return max(points // max(batch, 1), fewest)
 
 
 def nodes(seed: int, count: int, n: int, batch: int) -> Tensor:

@@ -4,6 +4,9 @@ Where h and g are smooth, its derivatives may be pathwise or by Stein's sums, se
 With kinks, as of an absolute error, slopes are pathwise and second derivatives are not. With jumps no derivative is.
 `smoothness` tells. Derivatives of a surrogate that follows hard edges vary fast within a sigma: there Stein's sums have
 the smaller variance. Their error grows with the number of parameters, the pathwise one does not. `measure` compares.
+
+Where a head goes through large outputs, second derivatives along the points take long, and slopes do not. Then Stein's
+sums of the slopes are compared, too.
 """
 
 import copy
@@ -32,6 +35,8 @@ _SUMS = 4
 of the variances of the outputs as its mean."""
 _REPEATS = 8
 """Means over other points, which measure the variance of one."""
+_TRIED_POINTS = 16
+"""Points of each of them, if a point is costly."""
 _SHORTER = 4
 """Points of the term per point at which a surrogate is looked at for jumps and kinks once more, at least."""
 _LOOKED = 512
@@ -73,7 +78,7 @@ class SurrogateTerm:
         memory, (B, n) = control.memory, x.shape
         measure(control, x, aux, sigma, order, seed)
         pathwise = memory.pathwise or 0
-        u = nodes(seed, per_element(memory.draws, n, B, pathwise=pathwise), n, B).to(x.device)
+        u = nodes(seed, point_count(control, B, n, pathwise), n, B).to(x.device)
         with outside_inference():
             copies = [one.clone() for one in aux]
             return cls(copy.deepcopy(memory.surrogate), control, x.clone(), copies, sigma, u, pathwise, seed)
@@ -250,17 +255,31 @@ def measure(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, o
     if memory.pathwise == 0 or (memory.pathwise and known_smooth(control)):
         return
     with torch.inference_mode(False), without_autocast(x.device):  # which would round derivatives, too
-        u = nodes(seed, per_element(memory.draws, n, B, pathwise=2), n, B).to(x.device)
+        u = nodes(seed, point_count(control, B, n, 2), n, B).to(x.device)
         orders = _smooth_orders(control, x, aux, sigma, u, seed)
         if memory.pathwise and orders in (None, memory.pathwise):
             return
-        if orders and len(sigma) <= MOST_STEIN:
+        if orders and n <= MOST_STEIN:
+            tried = nodes(seed, _TRIED_POINTS, n, B).to(x.device) if control.costly else u
             few = [one[:_TRIED].clone() for one in (x, *aux)]
-            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u[:_TRIED], orders, seed, _SUMS)
-            quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
-            own, others = (float(one.variance_of_pairs(quantity).sum()) for one in (term, replace(term, pathwise=0)))
-            orders = orders if own < others else 0
+            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, tried[:_TRIED], orders, seed, _SUMS)
+            orders = _best_way(term, "gradient" if order == 1 else "hessian_diagonal")
     memory.pathwise = orders
+
+
+def _best_way(term: SurrogateTerm, quantity: Quantity) -> int:
+    """Return how many derivatives to take along the points: least variance, times cost if a point is costly."""
+    ways = {0: 1.0, term.pathwise: 1.0}
+    if term.control.costly and term.pathwise == 2 and quantity != "gradient":
+        ways = {0: 1.0, 1: 3.0, 2: 3.0 * (2 + len(term.sigma))}  # losses, slopes, and products for all parameters
+    variances = {way: float(replace(term, pathwise=way).variance_of_pairs(quantity).sum()) for way in ways}
+    return min(ways, key=lambda way: ways[way] * variances[way])
+
+
+def point_count(control: Control, B: int, n: int, pathwise: int) -> int:
+    """Return how many points of the term each element of a batch has."""
+    few = control.costly and control.outer.linear  # the logarithm of a mean over few points is biased
+    return per_element(control.memory.draws, n, B, pathwise=pathwise, costly=few)
 
 
 def _smooth_orders(

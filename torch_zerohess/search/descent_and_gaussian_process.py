@@ -12,7 +12,7 @@ if the descent arrives elsewhere than at the lowest minimum.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from torch_zerohess.search.descent.of_output import OutputDescent, OutputDescent
 from torch_zerohess.search.gaussian_process.of_output import OutputProcess, OutputProcessProgress
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.relay import Relay
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 
 _SLOW = 0.2

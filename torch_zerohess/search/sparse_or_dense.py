@@ -12,7 +12,7 @@ to be kept. The search changes if the Jacobian of the other one predicts more, b
 Jacobian, this must also predict more than `_MOST`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -21,6 +21,7 @@ from torch import Tensor
 from torch_zerohess.search.descent.of_output import OutputDescent, OutputDescentProgress
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.relay import Relay
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 from torch_zerohess.search.sparse.method import SparseMethod
 from torch_zerohess.search.sparse.progress import SparseProgress

@@ -3,7 +3,6 @@
 from __future__ import annotations  # signatures print names of types, not what they stand for
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Literal, get_args
 
 from torch import Tensor
@@ -13,6 +12,7 @@ from torch_zerohess.search.descent_and_gaussian_process import DescentAndProcess
 from torch_zerohess.search.gaussian_process.search import process_method
 from torch_zerohess.search.protocol.ask_tell import AskTell
 from torch_zerohess.search.protocol.method import Method, Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.space import Bounds, Vector
 from torch_zerohess.search.sparse.noisy_method import sparse_method
 from torch_zerohess.search.sparse.settings import SPARSE_TOLERANCE, SparseSearchSettings

@@ -13,6 +13,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -33,6 +34,27 @@ DEVIATION_DEGREES = 7
 """Degrees of freedom of a deviation that the caller knows: as many as eight values at one point give."""
 _FLAT = 1e-14
 """Change of outputs, relative to their size, that is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Eigenvalues and vectors of the covariances of points [P, n], for every structure, kernel and length.
+
+    They are computed once, and serve the evidence of any outputs at these points.
+    """
+
+    points: Tensor
+    structures: Sequence[Structure] = ("joint",)
+
+    @cached_property
+    def decomposed(self) -> tuple[Tensor, Tensor]:
+        """Eigenvalues [structures * kernels * lengths, P], and vectors in columns."""
+        every = []
+        for structure in self.structures:
+            separation = separations(structure, self.points, self.points)
+            every += [covariances(structure, kernel, separation / length) for kernel in KERNELS for length in LENGTHS]
+        values, vectors = torch.linalg.eigh(torch.stack(every) + CONSTANT)
+        return values, vectors
 
 
 @dataclass(frozen=True)
@@ -62,6 +84,7 @@ class GaussianProcess:
         noises: Sequence[float] = NOISES,
         deviation: float | None = None,
         structures: Sequence[Structure] = ("joint",),
+        spectra: Spectra | None = None,
     ) -> "GaussianProcess":
         """Choose structure, kernel, length and noise from their lists by the evidence; condition on P >= 2 outputs.
 
@@ -71,6 +94,7 @@ class GaussianProcess:
             noises: levels to choose from.
             deviation: standard deviation of repeated outputs at one point, if it is known.
             structures: of the kernel, to choose from.
+            spectra: of the same points and structures, if it is known.
         """
         mean = outputs.mean(0)
         change = outputs - mean
@@ -79,7 +103,8 @@ class GaussianProcess:
         scale = max(largest, deviation or 0.0)  # neither change nor deviation overflows when it is squared
         relative = None if deviation is None or flat else deviation / scale
         target = torch.zeros_like(change) if flat else change / scale
-        evidence, variances = grid_evidence(points, target, noises, relative, structures)
+        spectra = spectra or Spectra(points, structures)
+        evidence, variances = spectral_evidence(spectra, target, noises, relative)
         best = int(evidence.argmax())
         every = itertools.product(structures, KERNELS, LENGTHS, noises)
         structure, kernel, length, noise = next(itertools.islice(every, best, None))
@@ -119,11 +144,14 @@ class GaussianProcess:
 
 
 def grid_evidence(
-    points: Tensor,
-    change: Tensor,
-    noises: Sequence[float],
-    deviation: float | None = None,
-    structures: Sequence[Structure] = ("joint",),
+    points: Tensor, change: Tensor, noises: Sequence[float], deviation: float | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return `spectral_evidence` of points [P, n] for joint kernels."""
+    return spectral_evidence(Spectra(points), change, noises, deviation)
+
+
+def spectral_evidence(
+    spectra: Spectra, change: Tensor, noises: Sequence[float], deviation: float | None = None
 ) -> tuple[Tensor, Tensor]:
     """Log evidence for every structure, kernel, length and noise, and the most likely variance for each of them.
 
@@ -132,18 +160,16 @@ def grid_evidence(
     `DEVIATION_DEGREES` squares of that size, each of noise alone.
 
     Args:
-        points: [P, n].
+        spectra: of the points [P, n].
         change: outputs [P, m] less their mean, at most 1.
         noises: levels [N].
         deviation: of repeated outputs at one point, in the units of `change`; None if it is not known.
-        structures: of the kernel.
 
     Returns:
         Two tensors [structures * kernels * lengths, N].
     """
     P, m = change.shape
-    lengths, levels = points.new_tensor(LENGTHS), points.new_tensor(noises)
-    values, vectors = _spectra(points, structures)
+    levels, (values, vectors) = change.new_tensor(noises), spectra.decomposed
     power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
     spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [structures x kernels x lengths, N, P]
     squares, logs, count = (power[:, None] / spectrum).sum(2) / m, spectrum.log().sum(2), P
@@ -155,29 +181,24 @@ def grid_evidence(
         )
     variances = squares / count + math.ulp(0.0)
     evidence = -count * variances.log() - logs
-    evidence -= improbability(lengths).repeat(len(structures) * len(KERNELS))[:, None]
+    evidence -= _priors(spectra)[:, None]
     return evidence, variances
 
 
-def transformed_evidence(points: Tensor, columns: Tensor, structures: Sequence[Structure] = ("joint",)) -> Tensor:
-    """Highest log evidence [T], as in `grid_evidence`, for each column of values [P, T] at points [P, n] alone."""
-    P, lengths, levels = len(points), points.new_tensor(LENGTHS), points.new_tensor(NOISES)
-    values, vectors = _spectra(points, structures)
+def transformed_evidence(spectra: Spectra, columns: Tensor) -> Tensor:
+    """Highest log evidence [T], as in `spectral_evidence`, for each column of values [P, T] alone."""
+    P, levels, (values, vectors) = len(columns), columns.new_tensor(NOISES), spectra.decomposed
     power = (vectors.mT @ (columns - columns.mean(0))).square()  # [structures x kernels x lengths, P, T]
     spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [structures x kernels x lengths, N, P]
     variances = spectrum.reciprocal() @ power / P + math.ulp(0.0)
-    prior = improbability(lengths).repeat(len(structures) * len(KERNELS))[:, None, None]
+    prior = _priors(spectra)[:, None, None]
     return (-P * variances.log() - spectrum.log().sum(2)[..., None] - prior).flatten(0, 1).amax(0)
 
 
-def _spectra(points: Tensor, structures: Sequence[Structure]) -> tuple[Tensor, Tensor]:
-    """Eigenvalues and vectors of the covariances of points [P, n], for every structure, kernel and length."""
-    every = []
-    for structure in structures:
-        separation = separations(structure, points, points)
-        every += [covariances(structure, kernel, separation / length) for kernel in KERNELS for length in LENGTHS]
-    values, vectors = torch.linalg.eigh(torch.stack(every) + CONSTANT)
-    return values, vectors
+def _priors(spectra: Spectra) -> Tensor:
+    """Minus 2 times the log prior of the length of each structure, kernel and length."""
+    lengths = spectra.points.new_tensor(LENGTHS)
+    return improbability(lengths).repeat(len(spectra.structures) * len(KERNELS))
 
 
 def improbability(lengths: Tensor) -> Tensor:

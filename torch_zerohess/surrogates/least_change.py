@@ -45,24 +45,31 @@ _CUBIC_OUTPUT = 1e-3
 """Like `_ROUGH`, for the quadratics of outputs: their slopes are trusted, and not their curvatures."""
 
 
-def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Tensor, Tensor]:
+def least_change(
+    u: Tensor, values: Tensor, hessian: Tensor, shared: "Interpolation | None" = None
+) -> tuple[float, Tensor, Tensor]:
     """Return value, gradient [n] and Hessian [n, n] at u = 0 of the quadratic of least change.
 
     Args:
         u: points [P, n], of the order of 1.
         values: [P], of the order of 1.
         hessian: the earlier one [n, n].
+        shared: of these points, if other values at them are interpolated, too.
 
     With fewer than n + 1 points the gradient has the least norm. With more points than a quadratic has coefficients the
     result is a regression. Near points count more than far ones, and much more where the points are few or where the
     likelihood of the values says so.
     """
-    deviations, _ = _likeliest(u, values[:, None], values.new_zeros(1), hessian)
+    deviations, _ = _likeliest(shared or Interpolation(u), values[:, None], values.new_zeros(1), hessian)
     return deviations.quadratic(values, hessian)
 
 
 def least_change_of_transform(
-    u: Tensor, values: Tensor, hessian: Tensor, earlier: LossTransform | None
+    u: Tensor,
+    values: Tensor,
+    hessian: Tensor,
+    earlier: LossTransform | None,
+    shared: "Interpolation | None" = None,
 ) -> tuple[LossTransform, Tensor, Tensor]:
     """Return the likeliest transform of losses, and gradient [n] and Hessian [n, n] at u = 0 of the transformed losses.
 
@@ -71,28 +78,44 @@ def least_change_of_transform(
         values: losses [P] above the lowest one, the largest of the order of 1.
         hessian: the earlier one [n, n].
         earlier: transform of the losses whose Hessian this is; None if it is of the losses themselves.
+        shared: of these points, if other values at them are interpolated, too.
     """
     transforms, columns, slopes = transformed(values)
-    deviations, k = _likeliest(u, columns, slopes, hessian)
+    deviations, k = _likeliest(shared or Interpolation(u), columns, slopes, hessian)
     if earlier is not None:
         hessian = transforms[k].hessian_ratio(earlier) * hessian
     _, gradient, hessian = deviations.quadratic(columns[:, k], hessian)
     return transforms[k], gradient, hessian
 
 
-def _likeliest(u: Tensor, columns: Tensor, slopes: Tensor, hessian: Tensor) -> tuple["_Deviations", int]:
+class Interpolation:
+    """What quadratics of least change share that interpolate values at the same points u [P, n]."""
+
+    def __init__(self, u: Tensor) -> None:
+        self.u = u
+        few = len(u) < _FEW * coefficient_count(u.shape[1])
+        self.rates = {_OF_FEW: 0.0} if few else {_CUBIC: 0.0, _ROUGH: -math.log(_LIKELIER)}
+        """Rates of growth of the variances to choose from, and the logarithms of their prior probabilities."""
+        self._kept: list[_Deviations] = []
+
+    def processes(self, hessian: Tensor) -> list["_Deviations"]:
+        """Return the process of each rate. Up to four parameters the earlier Hessian changes none of them."""
+        if not self._kept or self.u.shape[1] > _TOLD:
+            bend = _curved(self.u, _multiple(hessian))
+            self._kept = [_Deviations.of(self.u, bend, rate) for rate in self.rates]
+        return self._kept
+
+
+def _likeliest(shared: Interpolation, columns: Tensor, slopes: Tensor, hessian: Tensor) -> tuple["_Deviations", int]:
     """Return the likeliest process of deviations, and for which column of values [P, T] it is.
 
     slopes: the mean logarithms [T] of dy/dv, where the columns y are functions of values v.
     """
-    P, n = u.shape
-    bend = _curved(u, _multiple(hessian))
-    few = len(u) < _FEW * coefficient_count(n)
-    rates = {_OF_FEW: 0.0} if few else {_CUBIC: 0.0, _ROUGH: -math.log(_LIKELIER)}
-    processes = [_Deviations.of(u, bend, rate) for rate in rates]
+    P, n = shared.u.shape
+    processes = shared.processes(hessian)
     degrees = max(P - n - 1, 1)  # the slopes count as often as values do that the affine function leaves free
     likelihoods = torch.stack([one.likelihood(columns) + degrees * slopes for one in processes])
-    likelihoods += likelihoods.new_tensor(list(rates.values()))[:, None]
+    likelihoods += likelihoods.new_tensor(list(shared.rates.values()))[:, None]
     process, column = divmod(int(likelihoods.argmax()), columns.shape[1])
     return processes[process], column
 

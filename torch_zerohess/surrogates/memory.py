@@ -44,9 +44,10 @@ class Memory:
 
     Torch differentiates the first term as far as h(g(z), r) is smooth in z, and Stein's identity does the rest: the
     second derivatives where slopes jump (an absolute error, ReLUs), and all of them where values jump (a threshold, a
-    tree, a table) or torch knows no derivative (NumPy). A head or a surrogate of yours is tested for kinks and jumps at
-    every call, along up to 32 random segments. Kinks that are so rare that no segment meets them stay unseen in that
-    call.
+    tree, a table) or torch knows no derivative (NumPy). A head of yours that takes outputs of more than 256 numbers
+    gives second derivatives by Stein's identity, too, where that saves more time than it adds variance. A head or a
+    surrogate of yours is tested for kinks and jumps at every call, along up to 32 random segments. Kinks that are so
+    rare that no segment meets them stay unseen in that call.
 
     Args:
         surrogate: an object with `fit(points [P, n], outputs [P, *out])` and a differentiable
@@ -68,8 +69,9 @@ class Memory:
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
         draws: points per element at which the surrogate's term is evaluated, at least 3. None: for more than 32
-            parameters 4, or 64 with kinks or jumps; for fewer 1024 / B and at least 64. An affine surrogate under
-            `heads.SquaredError` needs none in a layer: the expectation is known.
+            parameters 4, or 64 with kinks or jumps; for fewer 1024 / B and at least 64. A head of yours that takes
+            outputs of more than 256 numbers, and has slopes, gets 256 / B and at least 32: it takes most of the time.
+            An affine surrogate under `heads.SquaredError` needs none in a layer: the expectation is known.
 
     `capacity`, `fresh`, `order` and `draws` may be set between calls.
 

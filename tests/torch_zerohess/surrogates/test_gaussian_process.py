@@ -13,6 +13,7 @@ from torch_zerohess.surrogates.gaussian_process import (
     LENGTHS,
     NOISES,
     GaussianProcess,
+    Spectra,
     grid_evidence,
     transformed_evidence,
 )
@@ -101,7 +102,7 @@ def test_the_highest_evidence_of_each_column_is_that_of_its_process():
     columns = waves(points)
     columns = (columns - columns.mean(0)) / columns.abs().max()
     alone = [grid_evidence(points, one[:, None], NOISES)[0].max() for one in columns.mT]
-    torch.testing.assert_close(transformed_evidence(points, columns + 3.0), torch.stack(alone))
+    torch.testing.assert_close(transformed_evidence(Spectra(points), columns + 3.0), torch.stack(alone))
 
 
 def test_a_known_deviation_counts_as_seven_values_of_noise_alone():

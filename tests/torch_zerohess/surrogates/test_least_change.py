@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.surrogates.least_change import LeastNorm, least_change, least_change_of_transform
+from torch_zerohess.surrogates.least_change import (
+    Interpolation,
+    LeastNorm,
+    least_change,
+    least_change_of_transform,
+)
 from torch_zerohess.surrogates.loss_transform import LossTransform
 from truths import vector
 
@@ -200,3 +205,20 @@ def test_the_hessian_of_an_earlier_square_is_told_to_a_later_one():
         for told, earlier in [(true / 3, LossTransform("square", 3 * shift)), (true, LossTransform("square", shift))]
     ]
     torch.testing.assert_close(found[0], found[1])
+
+
+@pytest.mark.parametrize("n", [2, 4, 5])
+def test_quadratics_at_the_same_points_share_what_they_can(n):
+    """Up to four parameters the processes are the same ones for every earlier Hessian. Results have the same bits."""
+    u, (_, H, f) = points(20, n, n), quadratic(n, n)
+    shared = Interpolation(u)
+    before = shared.processes(torch.zeros_like(H))
+    assert all(one is other for one, other in zip(before, shared.processes(H), strict=True)) is (n <= 4)
+    for alone, other in zip(
+        least_change(u, f(u).sin(), H)[1:], least_change(u, f(u).sin(), H, shared)[1:], strict=True
+    ):
+        assert torch.equal(alone, other)
+    losses = f(u).cosh() - 1.0
+    alone, other = (least_change_of_transform(u, losses, H, None, one) for one in (None, shared))
+    assert alone[0] == other[0]
+    assert torch.equal(alone[2], other[2])

@@ -8,13 +8,14 @@ axes together are the lowest point, and quadratics begin there.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated
 
 _SUM = 1e-5

@@ -10,7 +10,6 @@ whether the best point is a minimum.
 """
 
 import math
-from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -20,6 +19,7 @@ from torch_zerohess.linalg.hull import shortest
 from torch_zerohess.search.descent.metric_progress import MetricProgress
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import normal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 
 _BESIDE, _APART = 1e-4, ((1e-2, 1.0), (1.0, math.inf))

@@ -1,11 +1,11 @@
 """The rule after a step on a model of the loss: move to its end, shrink sigma, or let sigma grow on a plateau."""
 
 import math
-from dataclasses import replace
 
 from torch import Tensor
 
 from torch_zerohess.search.descent.progress import WIDEST, DescentProgress
+from torch_zerohess.search.protocol.replaced import replace
 
 _SLACK = 2.0
 """Standard deviations of the noise within which a decrease does not count."""

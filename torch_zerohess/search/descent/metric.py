@@ -12,19 +12,19 @@ losses: it would arrive at the same minimum.
 """
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
-from torch_zerohess.search.descent.metric_progress import MetricProgress
+from torch_zerohess.search.descent.metric_progress import Fitted, MetricProgress
 from torch_zerohess.search.descent.progress import DescentProgress
 from torch_zerohess.search.descent.smoothed import SmoothedQuadratics
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, are_same
 from torch_zerohess.search.region.method import RegionDescent
-from torch_zerohess.surrogates.least_change import least_change
+from torch_zerohess.surrogates.least_change import Interpolation, least_change
 from torch_zerohess.surrogates.plateau import is_plateau
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, fit_values
 from torch_zerohess.surrogates.quadratic_around import quadratic_around
@@ -247,18 +247,24 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     # Models.
 
     def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
-        u, values, size = self._fitted_to(known)
-        earlier = self._earlier(known, known.hessian, known.size / size, u, values)
-        _, gradient, hessian = least_change(u, values, earlier)
-        gradient, hessian = of_step(known, gradient, hessian)
-        return replace(known, size=size, gradient=gradient, hessian=hessian), len(u)
+        fitted = self._fitted_to(known)
+        return self._quadratic(known, fitted), len(fitted.u)
 
-    def _fitted_to(self, known: MetricProgress) -> tuple[Tensor, Tensor, float]:
-        """Return the nearest points u [P, n], their losses [P] above the lowest one over their size, and this size."""
+    def _quadratic(self, known: MetricProgress, fitted: Fitted) -> MetricProgress:
+        """Return the progress with a quadratic of the losses."""
+        u, values, size, shared = fitted
+        earlier = self._earlier(known, known.hessian, known.size / size, u, values)
+        _, gradient, hessian = least_change(u, values, earlier, shared)
+        gradient, hessian = of_step(known, gradient, hessian)
+        return replace(known, size=size, gradient=gradient, hessian=hessian)
+
+    def _fitted_to(self, known: MetricProgress) -> Fitted:
+        """Return the nearest points and their losses."""
         chosen = self._nearest(known, 2 * self._n + 1)
         values = known.values[chosen] - known.lowest.loss
         size = float(values.abs().max()) or 1.0
-        return known.scaled[chosen], values / size, size
+        u = known.scaled[chosen]
+        return Fitted(u, values / size, size, Interpolation(u))
 
     def _earlier(self, known: MetricProgress, hessian: Tensor, ratio: float, u: Tensor, values: Tensor) -> Tensor:
         """Return the earlier Hessian [n, n] by u, in the unit of the values [P].

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -10,7 +11,21 @@ from torch_zerohess.search.descent.axis_search import AxisLines
 from torch_zerohess.search.descent.progress import DescentProgress
 from torch_zerohess.search.protocol.state import Best
 from torch_zerohess.search.region.progress import RegionProgress
+from torch_zerohess.surrogates.least_change import Interpolation
 from torch_zerohess.surrogates.loss_transform import LossTransform
+
+
+class Fitted(NamedTuple):
+    """What quadratics are fitted to."""
+
+    u: Tensor
+    """The nearest points [P, n]."""
+    values: Tensor
+    """Their losses [P] above the lowest one, over their size."""
+    size: float
+    """Of the losses."""
+    shared: Interpolation
+    """Of the points."""
 
 
 @dataclass(frozen=True, eq=False)

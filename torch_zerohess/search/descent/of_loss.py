@@ -4,8 +4,6 @@ A round has arrived once its end is neither a kink from which the loss falls (`K
 next round the axes are searched where the loss is a sum (`AxisSearch`).
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -15,6 +13,7 @@ from torch_zerohess.search.descent.kink import KinkCheck, Verdict
 from torch_zerohess.search.descent.metric_progress import MetricProgress
 from torch_zerohess.search.descent.two_sided import TwoSidedQuadratics
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 
 _UNKNOWN = "the slopes around a kink do not show whether it is a minimum"

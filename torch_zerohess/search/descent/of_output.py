@@ -6,7 +6,7 @@ evidence is a step that lowers the loss and whose output was predicted well. Whe
 follows again from the best point, with the sigma that it had.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,6 +17,7 @@ from torch_zerohess.search.descent.smoothed import SmoothedQuadratics
 from torch_zerohess.search.gauss_newton.by_interpolation import OutputGaussNewton, OutputProgress
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.relay import Relay
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel

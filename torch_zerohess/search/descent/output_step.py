@@ -5,11 +5,11 @@ while, and sigma goes to zero. The worse the output of a step was predicted, the
 """
 
 import math
-from dataclasses import replace
 
 from torch import Tensor
 
 from torch_zerohess.search.descent.progress import WIDEST, DescentProgress
+from torch_zerohess.search.protocol.replaced import replace
 
 _FAITHFUL = 0.25
 """Misfit of a predicted output up to which the model needs no new evaluations."""

@@ -1,7 +1,6 @@
 """Descent by quadratic models of the smoothed function in a trust region tied to sigma."""
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from torch_zerohess.search.descent.pool_quadratic import NEAR, fit_pool, quadrat
 from torch_zerohess.search.descent.progress import BATCH, DescentProgress
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal, orthonormal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel

@@ -7,7 +7,6 @@ loss, so it has the same minimum. Steps lead to the minimum of the quadratic tha
 better.
 """
 
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -15,7 +14,8 @@ from torch import Tensor
 
 from torch_zerohess.search.descent.evidence import weighed
 from torch_zerohess.search.descent.metric import MetricQuadratics, of_step
-from torch_zerohess.search.descent.metric_progress import MetricProgress, TransformedQuadratic
+from torch_zerohess.search.descent.metric_progress import Fitted, MetricProgress, TransformedQuadratic
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.surrogates.least_change import least_change_of_transform
 
@@ -43,21 +43,23 @@ class TransformedQuadratics(MetricQuadratics):
         )
 
     def predicted(self, known: MetricProgress, x: Tensor) -> float:
-        return self._expected(super()._modelled(known)[0], x)  # by a quadratic of the losses: it is fitted faster
+        return self._expected(
+            super()._quadratic(known, self._fitted_to(known)), x
+        )  # by a quadratic of the losses: it is fitted faster
 
-    def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
-        known, count = super()._modelled(known)
-        u, values, size = self._fitted_to(known)
+    def _quadratic(self, known: MetricProgress, fitted: Fitted) -> MetricProgress:
+        known = super()._quadratic(known, fitted)
+        u, values, size, shared = fitted
         if len(u) <= _FEWEST * self._n:
-            return replace(known, transformed=None), count
+            return replace(known, transformed=None)
         before, transform, hessian, old_size = known.transformed, None, known.hessian, known.size
         if before is not None:
             hessian, old_size = before.hessian, before.size
             transform = replace(before.transform, shift=before.transform.shift * old_size / size)
         earlier = self._earlier(known, hessian, old_size / size, u, values)
-        transform, gradient, hessian = least_change_of_transform(u, values, earlier, transform)
+        transform, gradient, hessian = least_change_of_transform(u, values, earlier, transform, shared)
         found = TransformedQuadratic(transform, size, *of_step(known, gradient, hessian))
-        return replace(known, transformed=found), count
+        return replace(known, transformed=found)
 
     def _learned(self, known: MetricProgress, count: int) -> Tensor:
         return super()._learned(_with(known), count)

@@ -8,7 +8,6 @@ The metric of the region is learned from the Hessian of the quadratics mixed as 
 along the kink.
 """
 
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -20,6 +19,7 @@ from torch_zerohess.search.descent.evidence import weighed
 from torch_zerohess.search.descent.metric import CURVED
 from torch_zerohess.search.descent.metric_progress import MetricProgress, TwoSides
 from torch_zerohess.search.descent.transformed import TransformedQuadratics
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.surrogates.two_sides import fit_two_sides
 

@@ -19,7 +19,7 @@ from __future__ import annotations  # signatures print names of types, not what 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -33,6 +33,7 @@ from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps, check
 from torch_zerohess.search.protocol.ask_tell import AskTell
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import orthonormal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.space import Bounds, Vector
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.protocol.told_values import check_range

@@ -20,7 +20,7 @@ Wild (2019), "Derivative-free optimization methods", for composite losses with k
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -30,6 +30,7 @@ from torch_zerohess.linalg.nonsmooth import kinked_minimum, mirrored
 from torch_zerohess.search.gauss_newton.kinked_steps import NOTHING, holds, shortened
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import normal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 from torch_zerohess.search.region.method import BAD, LONG, NEAR, RegionDescent
 from torch_zerohess.search.region.progress import RegionProgress

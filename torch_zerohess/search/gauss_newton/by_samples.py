@@ -7,7 +7,7 @@ and how the model is solved for a step.
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torch_zerohess.search.gauss_newton.kinked_steps import Steps
 from torch_zerohess.search.protocol.method import Method
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 

@@ -7,7 +7,7 @@ unexplained, where models of the nearest evaluations leave next to nothing. A su
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torch_zerohess.search.gaussian_process.method import APART, ProcessMethod
 from torch_zerohess.search.gaussian_process.progress import ProcessProgress
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.search.region.method import RegionDescent
 from torch_zerohess.search.region.progress import RegionProgress

@@ -10,7 +10,6 @@ In noise the best point is the one whose *predicted* output has the lowest loss.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -23,8 +22,9 @@ from torch_zerohess.search.gaussian_process.progress import ProcessProgress
 from torch_zerohess.search.gaussian_process.warp import LOOK, likeliest
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal, orthonormal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
-from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
+from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess, Spectra
 from torch_zerohess.surrogates.kernels import structures
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -257,33 +257,33 @@ class ProcessMethod(Method[Q]):
         spread = max(float(values.max()) - least, self.settings.noise) or 1.0
         values = (values - least) / spread  # neither their squares nor that of the noise overflow
         noise = self.settings.noise / spread
-        looks = noise > 0.0 and known.iterations % LOOK == 0
+        looks, spectra = noise > 0.0 and known.iterations % LOOK == 0, Spectra(known.pool.points, self._structures)
         if not looks and (noise or self.settings.loss is None):  # the best point keeps its loss on every scale
-            values = likeliest(known.pool.points, values, noise, self._structures)
-        known, process = self._fitted(known, values[:, None], noise)
+            values = likeliest(spectra, values, noise)
+        known, process = self._fitted(known, values[:, None], noise, spectra)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]
             known = known if looks else self._judged(known, values * spread + least)
         return known, LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
 
-    def _fitted(self, known: Q, outputs: Tensor, deviation: float = 0.0) -> tuple[Q, GaussianProcess]:
+    def _fitted(
+        self, known: Q, outputs: Tensor, deviation: float = 0.0, spectra: Spectra | None = None
+    ) -> tuple[Q, GaussianProcess]:
         """Return the process of outputs [P, m]; if it ceases to find noise, the best point is `record` again.
 
         An output that is not finite is replaced by the output with the highest loss, and is no evidence of noise. A
         loss alone is too little evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
-        deviation: of repeated outputs at one point; 0 if it is not known.
+        deviation: of repeated outputs at one point; 0 if it is not known. spectra: of the pool, if they are known.
         """
         pool, holes, noises = known.pool, known.holes, NOISES + HIGH_NOISES if self.tells_noise(known) else NOISES
+        points, spectra = (torch.cat([pool.points, holes]), None) if len(holes) else (pool.points, spectra)
         if len(holes) and noises != NOISES and not self.settings.noise:
-            noise = GaussianProcess.fit(pool.points, outputs, noises, None, self._structures).noise
-            noises = noises if noise >= HIGH_NOISES[0] else NOISES
+            found = GaussianProcess.fit(pool.points, outputs, noises, None, self._structures)
+            noises = noises if found.noise >= HIGH_NOISES[0] else NOISES
         outputs = torch.cat([outputs, outputs[int(pool.values.argmax())].expand(len(holes), -1)])
-        process = GaussianProcess.fit(
-            torch.cat([pool.points, holes]), outputs, noises, deviation or None, self._structures
-        )
+        process = GaussianProcess.fit(points, outputs, noises, deviation or None, self._structures, spectra)
         noisy = self.settings.noise > 0.0 or process.noise >= HIGH_NOISES[0]
-        best = known.record if known.noisy and not noisy else known.best
-        return replace(known, noisy=noisy, best=best), process
+        return replace(known, noisy=noisy, best=known.record if known.noisy and not noisy else known.best), process
 
     def _judged(self, known: Q, values: Tensor) -> Q:
         """Make the point of the pool with the lowest of values [P] the best one."""

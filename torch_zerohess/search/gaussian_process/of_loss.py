@@ -9,7 +9,7 @@ and Doye 1997, Leary 2000). Where the loss is a sum of functions of one paramete
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from torch_zerohess.search.gaussian_process.finish import PATIENCE, FinishedProc
 from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import fractions, uniform
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count
 

@@ -13,7 +13,7 @@ a higher minimum does not count against the best point.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from torch_zerohess.search.gauss_newton.by_interpolation import OutputGaussNewto
 from torch_zerohess.search.gaussian_process.finish import PATIENCE, FinishedProcess, FinishedProgress
 from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel

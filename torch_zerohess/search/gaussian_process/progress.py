@@ -1,12 +1,13 @@
 """The progress of a search by a Gaussian process between two evaluations."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Progress
 from torch_zerohess.surrogates.pool import Pool
 

@@ -15,13 +15,17 @@ resolve low losses.
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, grid_evidence, transformed_evidence
-from torch_zerohess.surrogates.kernels import Structure
+from torch_zerohess.surrogates.gaussian_process import (
+    HIGH_NOISES,
+    NOISES,
+    Spectra,
+    spectral_evidence,
+    transformed_evidence,
+)
 from torch_zerohess.surrogates.loss_transform import transformed
 
 LOOK = 4
@@ -32,28 +36,28 @@ _UNITS = (300.0, 30.0)
 """Units u of a warp, over the noise, to choose from. No warp is the third choice."""
 
 
-def likeliest(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
+def likeliest(spectra: Spectra, losses: Tensor, deviation: float) -> Tensor:
     """Return losses [P] on the scale on which a process has the highest evidence.
 
     Args:
-        points: [P, n].
+        spectra: of the process at the points [P, n].
         losses: [P], the lowest one 0, the highest one at most 1.
         deviation: standard deviation of repeated losses at one point; 0 if they are the same.
-        structures: of the kernel of the process.
     """
     if deviation:
-        return _warped(points, losses, deviation, structures)
-    return _transformed(points, losses, structures) if len(points) > points.shape[1] + 1 else losses
+        return _warped(spectra, losses, deviation)
+    P, n = spectra.points.shape
+    return _transformed(spectra, losses) if n + 1 < P else losses
 
 
-def _warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequence[Structure]) -> Tensor:
+def _warped(spectra: Spectra, losses: Tensor, deviation: float) -> Tensor:
     """Return noisy losses, warped or as they are."""
     likely, highest = losses, -math.inf
     for unit in (math.inf, *(one * deviation for one in _UNITS)):
         scaled = losses / unit
         values = losses if unit == math.inf else unit * scaled.asinh()
         change = (values - values.mean())[:, None]
-        evidence, _ = grid_evidence(points, change, NOISES + HIGH_NOISES, deviation, structures)
+        evidence, _ = spectral_evidence(spectra, change, NOISES + HIGH_NOISES, deviation)
         # Twice the log likelihood. It is not finite where `scaled` overflows, and then the unit is not chosen.
         total = float(evidence.max()) - float(scaled.square().log1p().sum())
         if total > highest:
@@ -61,10 +65,10 @@ def _warped(points: Tensor, losses: Tensor, deviation: float, structures: Sequen
     return likely
 
 
-def _transformed(points: Tensor, losses: Tensor, structures: Sequence[Structure]) -> Tensor:
+def _transformed(spectra: Spectra, losses: Tensor) -> Tensor:
     """Return losses without noise, under a transform or as they are."""
     _, columns, slopes = transformed(losses)
     columns, slopes = torch.cat([columns, losses[:, None]], 1), torch.cat([slopes, slopes.new_zeros(1)])
-    evidence = transformed_evidence(points, columns, structures) + 2.0 * len(points) * slopes
+    evidence = transformed_evidence(spectra, columns) + 2.0 * len(losses) * slopes
     evidence[-1] += _PLAIN
     return columns[:, int(evidence.argmax())]

@@ -14,7 +14,6 @@ from __future__ import annotations  # signatures print names of types, not what 
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -23,12 +22,14 @@ from torch import Tensor
 from torch_zerohess.arguments import check_state, checked_integer, checked_number, checked_seed
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.reference import Reference, reference
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.space import Bounds, Space, Vector, checked_start
 from torch_zerohess.search.protocol.standing import Standing
 from torch_zerohess.search.protocol.state import Evaluated, P, State, plain, restored, restored_progress
 from torch_zerohess.search.protocol.told_values import as_evaluated, check_start, converted, joined
 from torch_zerohess.search.protocol.white_box import checked_loss
 from torch_zerohess.smoothing import random_seed
+from torch_zerohess.threads import one_thread
 from torch_zerohess.version import VERSION
 
 
@@ -187,7 +188,8 @@ class AskTell(Standing[P]):
             check_start(evaluated)
         generator = torch.Generator()
         generator.set_state(self._state.random)
-        self._state = self._after(*self._method.after(self._state.progress, evaluated, generator), generator)
+        with one_thread(len(self.unit), values.shape[1:].numel()):
+            self._state = self._after(*self._method.after(self._state.progress, evaluated, generator), generator)
         self._out, self._asked, self._early, self._drawn = points[:0], {}, {}, None
         self.told = evaluated.usable
         self.reference = reference(self.reference, evaluated)
@@ -252,7 +254,9 @@ class AskTell(Standing[P]):
         generator = torch.Generator()
         generator.set_state(self._state.random)
         generator.manual_seed(int(torch.randint(2**63 - 1, (), generator=generator, device="cpu")))
-        further = self._method.more(self._state.progress, points, batch - len(points), generator)
+        progress = self._state.progress
+        with one_thread(len(self.unit), progress.shape.numel()):
+            further = self._method.more(progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
 
     def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:

@@ -7,13 +7,14 @@ the points to evaluate next.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Generic
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.random_points import normal, reflect, uniform
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated, P
 from torch_zerohess.search.protocol.told_values import moderate
 from torch_zerohess.surrogates.quadratic import LocalModel

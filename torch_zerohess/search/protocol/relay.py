@@ -1,13 +1,13 @@
 """A search that forwards every question to the inner search whose turn it is."""
 
 from abc import abstractmethod
-from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.method import Method
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import P
 from torch_zerohess.surrogates.quadratic import LocalModel
 

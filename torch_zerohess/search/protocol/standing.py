@@ -2,7 +2,6 @@
 
 from abc import ABC
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Generic
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.protocol.method import Method
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.space import Space
 from torch_zerohess.search.protocol.state import P, State
 from torch_zerohess.surrogates.quadratic import LocalModel

@@ -3,12 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.version import written_by
 
 T = TypeVar("T")

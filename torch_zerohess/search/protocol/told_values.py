@@ -3,7 +3,6 @@
 import math
 import reprlib
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,6 +13,7 @@ from torch_zerohess.estimation.inputs import times_changed
 from torch_zerohess.evaluators.returned import ReturnedTypeError, ReturnedValueError
 from torch_zerohess.evaluators.single_nan import alike, filled, without_output
 from torch_zerohess.evaluators.values import as_tensor
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 
 _LARGEST = 1e305

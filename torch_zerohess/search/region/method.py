@@ -6,7 +6,6 @@ to the evaluations, how B is learned, and how the search ends.
 
 import math
 from abc import abstractmethod
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -16,6 +15,7 @@ from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.linalg.subproblem import SINGULAR
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import fractions, normal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated, not_finite
 from torch_zerohess.search.region.border import borders_between
 from torch_zerohess.search.region.progress import R, RegionProgress

@@ -1,12 +1,14 @@
 """The progress of a search by quadratics in a trust region, between two evaluations."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.search.region.cut_steps import CutSteps
 from torch_zerohess.surrogates.pool import latest
@@ -64,7 +66,7 @@ class RegionProgress(Progress):
         """Whether so many batches in a row were lost that the round ends."""
         return self.lost >= (LOST if self.border is None else _AT_BORDER)
 
-    @property
+    @cached_property
     def scaled(self) -> Tensor:
         """The evaluations as u [P, n]."""
         return torch.linalg.solve(self.root, (self.points - self.lowest.point).mT).mT / self.sigma

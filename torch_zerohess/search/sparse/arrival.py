@@ -7,7 +7,6 @@ towards the minimum. If steps towards the minimum do not lower the loss, the rou
 """
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from torch import Tensor
 from torch_zerohess.search.gauss_newton.by_samples import INSIDE, SHRINKING, STEP_LENGTHS, GaussNewton
 from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.sparse.progress import SparseProgress
 from torch_zerohess.search.sparse.settings import SparseSearchSettings
 from torch_zerohess.search.sparse.steps import sparse_steps, thorough_step

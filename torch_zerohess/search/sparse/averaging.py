@@ -11,12 +11,13 @@ constant. Where it differs from the outputs at the center by more than noise may
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.sparse.noisy_step import constants, step_in_noise
 from torch_zerohess.search.sparse.progress import SparseProgress

@@ -18,7 +18,6 @@ else to its slow steps until it arrives (monotonic basin hopping: Wales and Doye
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -26,6 +25,7 @@ from torch import Tensor
 
 from torch_zerohess.search.gauss_newton.kinked_steps import NOTHING
 from torch_zerohess.search.protocol.random_points import normal
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.protocol.told_values import in_range
 from torch_zerohess.search.sparse.arrival import MOST, SparseArrivals

@@ -6,12 +6,11 @@ on no single output is trusted, and the search neither hops nor ends by itself: 
 exact.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.search.sparse.averaging import Averaging
 from torch_zerohess.search.sparse.method import SparseMethod

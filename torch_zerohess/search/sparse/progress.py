@@ -1,12 +1,13 @@
 """What the search of `LocalGaussNewton` knows."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.search.gauss_newton.by_samples import JacobianProgress
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.protocol.told_values import check_range
 from torch_zerohess.surrogates.determined_jacobian import better_determined

@@ -1,11 +1,12 @@
 """Settings that only the search by a sparse Jacobian has."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.search.protocol.method import Settings
+from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples
 
 SPARSE_TOLERANCE = 5e-4

@@ -7,6 +7,7 @@ import torch
 
 from torch_zerohess.optim import GaussianProcessSearch
 from torch_zerohess.search.gaussian_process.warp import likeliest
+from torch_zerohess.surrogates.gaussian_process import Spectra
 from truths import vector
 
 
@@ -23,7 +24,7 @@ def test_the_evidence_finds_the_scale_on_which_losses_are_smooth(unit):
         losses = losses + torch.randn(60, generator=generator, dtype=torch.float64)  # noise of standard deviation 1
         losses = losses - losses.min()
         size = float(losses.max())
-        scaled = size * likeliest(points, losses / size, 1.0 / size, ("joint",))
+        scaled = size * likeliest(Spectra(points), losses / size, 1.0 / size)
         found += torch.allclose(scaled, losses if unit == math.inf else unit * (losses / unit).asinh())
     assert found >= 8
 
@@ -45,7 +46,7 @@ def test_the_evidence_finds_the_transform_of_losses_without_noise(made):
             "logarithm": 0.1 * (2.397895 * smooth).expm1(),
             "losses": smooth,
         }
-        scaled = likeliest(points, made_from[made], 0.0, ("joint",))
+        scaled = likeliest(Spectra(points), made_from[made], 0.0)
         off = scaled - scaled.mean() - (scaled.std() / smooth.std()) * (smooth - smooth.mean())
         found += torch.equal(scaled, smooth) if made == "losses" else float(off.std()) < 0.1 * float(scaled.std())
     assert found >= 8
@@ -56,7 +57,7 @@ def test_losses_that_overflow_over_the_noise_are_not_warped(deviation):
     points = torch.linspace(-1.0, 1.0, 8, dtype=torch.float64)[:, None]
     losses = (points[:, 0] - points[0, 0]).exp() / 10
     losses = losses - losses.min()
-    assert torch.equal(likeliest(points, losses, deviation, ("joint",)), losses)
+    assert torch.equal(likeliest(Spectra(points), losses, deviation), losses)
 
 
 def searched(loss, x0, sigma, bounds, noise, seed, evaluations):
@@ -105,3 +106,21 @@ def test_a_steep_loss_without_noise_takes_few_evaluations(f, most):
             search.tell(f(search.ask() - center).sum(1))
         counts.append(search.evaluations)
     assert sorted(counts)[2] <= most
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_step_decomposes_the_covariances_once(noise, monkeypatch):
+    """For the scale of the losses and for the process."""
+    counts, honest = [0], torch.linalg.eigh
+    search = GaussianProcessSearch(vector(0.5, -0.5), sigma=0.5, bounds=(-2.0, 2.0), noise=noise, seed=0)
+
+    def eigh(matrices):
+        counts[-1] += matrices.ndim == 3
+        return honest(matrices)
+
+    monkeypatch.setattr(torch.linalg, "eigh", eigh)
+    while search.evaluations < 20 and not search.done:
+        x = search.ask()
+        search.tell((x.square().sum(1) + (5.0 * x).sin().sum(1)).exp())
+        counts.append(0)
+    assert max(counts) == 1

@@ -56,3 +56,21 @@ def transformed(values: Tensor) -> tuple[list[LossTransform], Tensor, Tensor]:
     kinds: tuple[Literal["square", "logarithm"], ...] = ("square", "logarithm")
     transforms = [LossTransform(kind, shift) for kind in kinds for shift in _SHIFTS]
     return transforms, torch.cat([squares, logarithms], 1), torch.cat([slopes, -slopes])
+
+
+def warped(values: Tensor, unit: float) -> tuple[Tensor, Tensor]:
+    """Return u asinh(v / u), which is v up to about the unit u and a logarithm beyond, and its slopes.
+
+    Noise of low values keeps its standard deviation. Noise of high values becomes smaller, as values do.
+
+    Args:
+        values: losses v [P], in noise some are below 0.
+        unit: u, above 0; infinity returns the values.
+
+    Returns:
+        Values and slopes [P].
+    """
+    if unit == math.inf:
+        return values, torch.ones_like(values)
+    scaled = values / unit
+    return unit * scaled.asinh(), scaled.square().add(1.0).rsqrt()

@@ -1,11 +1,17 @@
-"""A quadratic through noisy values, and how certain each of its predictions is: Bayesian linear regression."""
+"""A quadratic through noisy values, and how certain each of its predictions is: Bayesian linear regression.
+
+A quadratic of a few parameters cannot follow losses that grow a hundred times as fast on one side of the minimum as on
+the other. It can follow warped losses better: equal to the losses where they are low, and a logarithm beyond. The
+likelihood says which losses it follows better (`fit_losses`).
+"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.loss_transform import warped
 from torch_zerohess.surrogates.quadratic import quadratic_terms, symmetric
 
 _CURVED = 2.0
@@ -20,6 +26,10 @@ _UNLIKELY = 2.0
 """Standard deviations of the mean squared residual by which it is larger than the noise in a misfit."""
 _UNSURE = 2.0
 """Factor by which the variance of the noise may be larger than given: eight values measure it no better."""
+_UNIT, _BELOW = 30.0, 2.0
+"""Unit of warped losses, and how far the lowest one is below its mean, over the noise."""
+_HIGHEST = 50.0
+"""Warped loss at the center over the unit, at most."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,8 @@ class NoisyQuadratic:
     """[q] with q = (n + 1)(n + 2)/2."""
     covariance: Tensor
     """[q, q]"""
+    variance: float
+    """Of a value, in units of the square of `size`: that of the noise, or the mean squared residual."""
     misfit: bool
     """Whether residuals are larger than the noise."""
     n: int
@@ -103,4 +115,29 @@ def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: 
     axes = prior[:, None] * axes
     covariance = (axes * (variance / (variance + told))) @ axes.mT
     misfit = residual > _UNSURE * least * (1.0 + _UNLIKELY * math.sqrt(2.0 / degrees))
-    return NoisyQuadratic(size, coefficients, covariance, misfit, n)
+    return NoisyQuadratic(size, coefficients, covariance, variance, misfit, n)
+
+
+def fit_losses(u: Tensor, losses: Tensor, weights: Tensor, noise: float, before: Tensor) -> NoisyQuadratic:
+    """Fit a quadratic to losses [P] at u [P, n], or to warped losses if they are likelier. Arguments as in `fit_noisy`.
+
+    Slopes and curvatures are those of the warped losses: their steps lead to the same minimum. The value is a loss.
+    """
+    plain = fit_noisy(u, losses, weights, noise, before)
+    if not plain.misfit or noise == 0.0:
+        return plain
+    unit, lowest = _UNIT * noise, float(losses.min()) + _BELOW * noise
+    values, slopes = warped(losses - lowest, unit)
+    fit = fit_noisy(u, values, weights, noise, before)
+    if not _likelihood(fit, weights) + 2.0 * float(weights @ slopes.log()) > _likelihood(plain, weights):
+        return plain  # also where values overflow
+    value = min(max(fit.value / unit, -_HIGHEST), _HIGHEST)
+    coefficients, factor = fit.coefficients.clone(), torch.ones_like(fit.coefficients)
+    coefficients[0] = (lowest + unit * math.sinh(value)) / fit.size
+    factor[0] = math.cosh(value)  # the slope of the loss by the warped one
+    return replace(fit, coefficients=coefficients, covariance=factor[:, None] * fit.covariance * factor)
+
+
+def _likelihood(fit: NoisyQuadratic, weights: Tensor) -> float:
+    """Return twice the log likelihood of the values that were fitted, without its constants."""
+    return -float(weights.sum()) * (math.log(fit.variance) + 2.0 * math.log(fit.size))

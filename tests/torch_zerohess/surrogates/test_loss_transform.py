@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.surrogates.loss_transform import LossTransform, transformed
+from torch_zerohess.surrogates.loss_transform import LossTransform, transformed, warped
 from truths import vector
 
 
@@ -46,3 +46,14 @@ def test_the_ratio_of_hessians_of_squares_of_one_cone():
     one, other = LossTransform("square", 1.0), LossTransform("square", 0.2)
     torch.testing.assert_close(other.hessian_ratio(one) * hessians[0], hessians[1])
     assert other.hessian_ratio(LossTransform("logarithm", 1.0)) == 1.0
+
+
+def test_warped_values_are_the_values_below_the_unit_and_logarithms_beyond():
+    v = vector(-0.01, 0.0, 0.01, 1e3, 1e200)
+    v.requires_grad_()
+    y, slopes = warped(v, 1.0)
+    torch.testing.assert_close(
+        y, vector(-0.01, 0.0, 0.01, math.log(2e3), math.log(2.0) + 200 * math.log(10.0)), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(slopes[:4], torch.autograd.grad(y.sum(), v)[0][:4])
+    assert torch.equal(warped(v, math.inf)[0], v)

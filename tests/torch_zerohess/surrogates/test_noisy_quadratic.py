@@ -6,7 +6,7 @@ import pytest
 import torch
 from searches import zeros
 
-from torch_zerohess.surrogates.noisy_quadratic import fit_noisy
+from torch_zerohess.surrogates.noisy_quadratic import fit_losses, fit_noisy
 from truths import vector
 
 GRADIENT = vector(1.0, -2.0)
@@ -76,3 +76,46 @@ def test_one_high_value_and_points_on_a_line(noise):
     fit = fitted(u, values, noise)
     assert bool(torch.isfinite(torch.cat([fit.gradient, fit.hessian.flatten(), fit.errors])).all())
     assert abs(fitted(u[:-1], values[:-1], 0.0).value - 5.0) < 1e-3
+
+
+def warped_losses(scale, count=80, seed=0):
+    """Points, and losses 30 sinh(q / 30) with noise of one: a quadratic when they are warped."""
+    u = points(count, seed)
+    q = scale * (u - vector(0.5, -0.5)).square().sum(1)
+    return u, 30.0 * (q / 30.0).sinh() + torch.randn(
+        count, generator=torch.Generator().manual_seed(1000 + seed), dtype=torch.float64
+    )
+
+
+def fitted_losses(u, losses):
+    return fit_losses(u, losses, torch.ones(len(u), dtype=torch.float64), 1.0, torch.zeros_like(HESSIAN))
+
+
+def test_losses_that_are_quadratic_when_they_are_warped():
+    """Losses reach 1e4. The value at the center is 30 sinh(0.5), within its error on most of 100 seeds."""
+    truth, far = 30.0 * math.sinh(0.5), 0
+    for seed in range(100):
+        u, losses = warped_losses(30.0, seed=seed)
+        fit, plain = fitted_losses(u, losses), fitted(u, losses, 1.0)
+        step, worse = (torch.linalg.solve(one.hessian, -one.gradient) for one in (fit, plain))
+        assert float((step - vector(0.5, -0.5)).norm()) < 0.02 < float((worse - vector(0.5, -0.5)).norm())
+        far += abs(fit.value - truth) > 2.0 * float(fit.errors[0]) + 2.0  # the lowest loss is known to a few noises
+    assert far <= 10
+
+
+def test_losses_that_are_nearly_quadratic_are_not_warped():
+    """Losses reach some 500, sixteen times the unit of a warp. Residuals are three times the noise."""
+    u = 3.0 * points(60)
+    losses = quadratic(u) + 3.0 * torch.randn(60, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    fit, plain = fitted_losses(u, losses), fitted(u, losses, 1.0)
+    assert fit.value == plain.value
+    assert torch.equal(fit.coefficients, plain.coefficients)
+    assert fit.misfit
+
+
+def test_warped_losses_that_rise_beyond_all_numbers():
+    """They are 1 to 1e150 along a line, and would be 1e450 at the center."""
+    u = torch.stack([torch.linspace(2.0, 3.0, 20, dtype=torch.float64), zeros(20)], 1)
+    fit = fitted_losses(u, 10.0 ** (450.0 - 150.0 * u[:, 0]))
+    assert bool(torch.isfinite(torch.cat([fit.gradient, fit.hessian.flatten(), fit.errors])).all())
+    assert math.isfinite(fit.value)

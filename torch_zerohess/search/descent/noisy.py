@@ -1,7 +1,7 @@
 """Descent on quadratics where the loss is noisy: regression in a learned metric, and no single value decides.
 
 An iteration evaluates a few random points of the region center + sigma B u, |u| <= 1, and fits a quadratic to all
-evaluations near by (`fit_noisy`). The center moves to the minimum of the quadratic within the region. The metric B
+evaluations near by (`fit_losses`). The center moves to the minimum of the quadratic within the region. The metric B
 moves towards |H|^(-1/2), as far as the curvature is known (`learned`).
 
 The next quadratic shows what a step has achieved, and sigma follows as in any trust region. In a region where noise
@@ -21,7 +21,7 @@ from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.random_points import normal
 from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress, not_finite
-from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
+from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_losses, fit_noisy
 from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficient_count, symmetric
 
@@ -146,7 +146,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         if len(near) < self._coefficients:
             return None
         n, before = self.settings.n, known.sigma**2 * known.hessian
-        fit = self._fit(known, u, near, self._least, before)
+        fit = fit_noisy(*self._near(known, u, near, self._least), self._noise, before)
         curvature = symmetric(fit.errors[1 + n :], n).diagonal()
         return LocalModel(fit.value, fit.gradient, fit.hessian, None, fit.errors[1 : 1 + n], curvature), known.sigma
 
@@ -232,14 +232,15 @@ class NoisyQuadratics(Method[NoisyProgress]):
         near = int((distance <= _REGION).sum())
         chosen = distance.argsort()[: min(max(self._least, near), self._most)]
         before = axes.mT @ known.hessian @ axes
-        return self._fit(known, u, chosen, self._coefficients + self.settings.n, before), near >= self._most
+        fitted = self._near(known, u, chosen, self._coefficients + self.settings.n)
+        return fit_losses(*fitted, self._noise, before), near >= self._most
 
-    def _fit(self, known: NoisyProgress, u: Tensor, chosen: Tensor, close: int, before: Tensor) -> NoisyQuadratic:
-        """Fit to chosen evaluations at u [P, n], nearest first, with weights as wide as the `close` nearest ones."""
+    def _near(self, known: NoisyProgress, u: Tensor, chosen: Tensor, close: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the chosen of u [P, n], nearest first, their losses, and weights as wide as the `close` nearest."""
         values = known.values[chosen]
         middle = values.median()
         high = float(middle) + _PROPORTION * max(float((values - middle).abs().median()), self._noise)
-        return fit_noisy(u[chosen], values.clamp(max=high), _weights(u[chosen], close), self._noise, before)
+        return u[chosen], values.clamp(max=high), _weights(u[chosen], close)
 
     def _judged(self, known: NoisyProgress, fit: NoisyQuadratic, back: Tensor) -> float:
         """Return sigma after what the last step has achieved, according to the new quadratic."""

@@ -26,7 +26,7 @@ from torch_zerohess.surrogates.gaussian_process import (
     spectral_evidence,
     transformed_evidence,
 )
-from torch_zerohess.surrogates.loss_transform import transformed
+from torch_zerohess.surrogates.loss_transform import transformed, warped
 
 LOOK = 4
 """One step in so many looks for other basins."""
@@ -54,12 +54,11 @@ def _warped(spectra: Spectra, losses: Tensor, deviation: float) -> Tensor:
     """Return noisy losses, warped or as they are."""
     likely, highest = losses, -math.inf
     for unit in (math.inf, *(one * deviation for one in _UNITS)):
-        scaled = losses / unit
-        values = losses if unit == math.inf else unit * scaled.asinh()
+        values, slopes = warped(losses, unit)
         change = (values - values.mean())[:, None]
         evidence, _ = spectral_evidence(spectra, change, NOISES + HIGH_NOISES, deviation)
-        # Twice the log likelihood. It is not finite where `scaled` overflows, and then the unit is not chosen.
-        total = float(evidence.max()) - float(scaled.square().log1p().sum())
+        # Twice the log likelihood. It is not finite where a slope is 0 by rounding, and then the unit is not chosen.
+        total = float(evidence.max()) + 2.0 * float(slopes.log().sum())
         if total > highest:
             likely, highest = values, total
     return likely

@@ -63,6 +63,43 @@ def test_which_steps_are_small(parameters: int, numbers: int, threads: int) -> N
         assert torch.get_num_threads() == threads
 
 
+def test_threads_of_python_that_begin_during_a_step_have_all_threads() -> None:
+    def count() -> None:
+        torch.ones(8).sum()
+        seen.append(torch.get_num_threads())
+
+    seen: list[int] = []
+    with one_thread(2, 1):
+        assert torch.get_num_threads() == 1
+        thread = threading.Thread(target=count)
+        thread.start()
+        thread.join()
+    assert seen == [2]
+
+
+def test_threads_are_set_back_after_an_interrupt_before_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(count: int) -> None:
+        patch.undo()
+        torch.set_num_threads(count)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "set_num_threads", interrupted)
+        with pytest.raises(KeyboardInterrupt), one_thread(2, 1):
+            pass
+    assert torch.get_num_threads() == 2
+
+
+def test_a_step_goes_on_where_no_thread_of_python_can_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refused)
+    with one_thread(2, 1):
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+
+
 def test_another_thread_of_python_leaves_the_setting() -> None:
     seen: list[int] = []
 

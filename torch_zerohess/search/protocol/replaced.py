@@ -10,7 +10,8 @@ T = TypeVar("T")
 def replace(known: T, **changes: Any) -> T:
     """Return a copy of a dataclass without `__post_init__` with other fields; TypeError for a field that it lacks.
 
-    `dataclasses.replace` does the same by a call of `__init__`, and takes ten times as long. Cached properties are not
+    `dataclasses.replace` does the same by a call of `__init__`, and takes four times as long: 10 microseconds for a
+    progress of 40 fields. Steps of two parameters by a loss alone would take 4 % longer. Cached properties are not
     copied.
     """
     kind, kept = type(known), vars(known)

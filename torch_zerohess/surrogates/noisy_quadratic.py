@@ -28,6 +28,8 @@ _UNSURE = 2.0
 """Factor by which the variance of the noise may be larger than given: eight values measure it no better."""
 _UNIT, _BELOW = 30.0, 2.0
 """Unit of warped losses, and how far the lowest one is below its mean, over the noise."""
+_LEAST = 1e-300
+"""Noise over the largest loss, at which losses over the noise overflow."""
 _HIGHEST = 50.0
 """Warped loss at the center over the unit, at most."""
 
@@ -124,7 +126,7 @@ def fit_losses(u: Tensor, losses: Tensor, weights: Tensor, noise: float, before:
     Slopes and curvatures are those of the warped losses: their steps lead to the same minimum. The value is a loss.
     """
     plain = fit_noisy(u, losses, weights, noise, before)
-    if not plain.misfit or noise == 0.0:
+    if not plain.misfit or noise <= _LEAST * plain.size:
         return plain
     unit, lowest = _UNIT * noise, float(losses.min()) + _BELOW * noise
     values, slopes = warped(losses - lowest, unit)

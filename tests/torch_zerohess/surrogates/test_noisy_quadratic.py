@@ -119,3 +119,13 @@ def test_warped_losses_that_rise_beyond_all_numbers():
     fit = fitted_losses(u, 10.0 ** (450.0 - 150.0 * u[:, 0]))
     assert bool(torch.isfinite(torch.cat([fit.gradient, fit.hessian.flatten(), fit.errors])).all())
     assert math.isfinite(fit.value)
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e-324, 1e-308])
+def test_noise_so_small_that_losses_over_it_overflow(noise):
+    u = points(40)
+    losses = 1e4 * u[:, 0].exp()
+    fit = fit_losses(u, losses, torch.ones(40, dtype=torch.float64), noise, torch.zeros_like(HESSIAN))
+    plain = fit_noisy(u, losses, torch.ones(40, dtype=torch.float64), noise, torch.zeros_like(HESSIAN))
+    assert torch.equal(fit.coefficients, plain.coefficients)
+    assert bool(torch.isfinite(fit.coefficients).all())

@@ -154,10 +154,12 @@ def minimize(
         known: evaluations of fn that there are already, in any order: points [m, n] and what fn returned for them, [m],
             or [m, *out] with `loss`. They may be (fit.points, fit.values) of a fit, or with `loss` (memory.points,
             memory.outputs). The search begins with all of them. They do not count as evaluations, and the best of them
-            may be `x`. Make it x0: a start that is not among them is evaluated first. If n points beside x0 have a
-            value, no samples around x0 are evaluated, so some should lie within a few sigma of it. Without `noise` the
-            value at x0 is compared with a new one. NaN stands for a point that has failed. Where a `checkpoint` goes
-            on, give the same points or None. ValueError for points outside of the bounds.
+            may be `x`. Make it x0: a start that is not among them is evaluated first. If n points within 4 sigma of x0,
+            root mean square over the parameters, have a value, no samples around x0 are evaluated. Models are fitted to
+            those nearest to x0. A Gaussian process keeps 256 of more points: they cover the box, most densely around
+            the best one. Without `noise` the value at x0 is compared with a new one. NaN stands for a point that has
+            failed. Where a `checkpoint` goes on, give the same points or None. ValueError for points outside of the
+            bounds.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Raises ValueError for an argument out of range, TypeError for one of another type or an unknown name.

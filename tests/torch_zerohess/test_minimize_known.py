@@ -70,7 +70,7 @@ def test_every_search_begins_with_them(name, batch):
     assert torch.equal(fit.points, f.points)
     assert not (f.points[:, None] == points).all(2).any()
     first = zh.optim.TrustRegion(zeros(2), sigma=0.5, seed=0, restarts=60, **settings)
-    every = torch.cat([zeros(2)[None], points])
+    every = torch.cat([zeros(2)[None], points[points.norm(dim=1).argsort(descending=True)]])
     first.tell_at(f.fn(every), every)
     assert torch.equal(f.points[1], first.ask(batch)[0])
     assert bool((fit.x - CENTER).abs().max() < 0.05)
@@ -135,6 +135,49 @@ def test_few_of_them_leave_the_samples():
     assert bool((fit.x - CENTER).abs().max() < 1e-3)
 
 
+@pytest.mark.parametrize("name", ENGINES)
+def test_the_order_of_many_of_them_does_not_matter(name):
+    """Each search keeps those that are near, wherever they stand."""
+    settings = {"noise": 0.0} | ENGINES[name]
+    fn = picture if "loss" in settings else bowl
+    points, values = scan(400, fn)
+    settings |= {"sigma": 0.1, "seed": 0, "max_evaluations": 8}
+    fits = [
+        zh.minimize(fn, zeros(2), known=(points[order], values[order]), **settings)
+        for order in (torch.arange(400), torch.arange(400).flip(0))
+    ]
+    assert torch.equal(fits[0].points, fits[1].points)
+    assert fits[0].value <= 1.0 + 1e-3 if fn is bowl else fits[0].value < 1e-6
+
+
+def test_those_far_away_are_no_samples():
+    """They neither replace the samples around the start nor enter the first model as if they were drawn there."""
+    truth = vector(0.7, 0.4, -0.3, 0.2)
+    directions = normal(40, 4)
+
+    def fn(z):
+        return torch.tanh(z @ directions.T)
+
+    def loss(y):
+        return (y - fn(truth[None])[0]).square().mean()
+
+    points = 2.0 * normal(100, 4)
+    best = points[torch.stack([loss(y) for y in fn(points)]).argmin()]
+    settings = {"engine": "descent", "sigma": 0.02, "seed": 0, "loss": loss, "noise": 0.0, "target": 1e-5}
+    alone = zh.minimize(fn, best, **settings)
+    fit = zh.minimize(fn, best, known=(points, fn(points)), **settings)
+    assert torch.equal(fit.points[:4], alone.points[1:5])  # the four samples
+    assert fit.evaluations < alone.evaluations
+
+
+def test_the_start_is_no_sample():
+    points = torch.cat([zeros(2)[None], normal(1, 2)])
+    f = Counted(bowl)
+    zh.minimize(f, zeros(2), sigma=0.5, seed=0, max_evaluations=6, noise=0.0, known=(points, bowl(points)))
+    alone = zh.minimize(bowl, zeros(2), sigma=0.5, seed=0, max_evaluations=6, noise=0.0)
+    assert torch.equal(f.points[:2], alone.points[1:3])
+
+
 def test_without_points_it_is_the_search_alone():
     one = zh.minimize(bowl, zeros(2), sigma=0.5, seed=0, max_evaluations=20, known=(torch.empty(0, 2), []))
     other = zh.minimize(bowl, zeros(2), sigma=0.5, seed=0, max_evaluations=20)
@@ -165,6 +208,23 @@ def test_a_checkpoint_has_them(tmp_path, at, with_loss):
         assert torch.equal(fit.values, whole.values)
         assert (fit.evaluations, fit.value, fit.status) == (whole.evaluations, whole.value, whole.status)
         assert torch.equal(fit.x, whole.x)
+
+
+def test_a_process_keeps_few_of_many():
+    """They lie everywhere, and most densely around the best one; a step takes no longer than with 256 of them."""
+    points = torch.rand(3000, 2, generator=torch.Generator().manual_seed(1)).double() * 4.0 - 2.0
+    losses = bowl(points)
+    best = points[losses.argmin()]
+    search = zh.optim.GaussianProcessSearch(best, sigma=0.5, bounds=(-2, 2), seed=0)
+    search.tell_at(losses, points)
+    kept = search.state_dict()["progress"]["pool"]["points"] * 0.5
+    assert len(kept) == 256
+    assert search.state_dict()["progress"]["room"] == 512
+    distance = (kept - best).norm(dim=1)
+    assert float(distance.min()) == 0.0
+    near = (points - best).norm(dim=1).sort().values[1:11]
+    assert int((distance[:, None] - near).abs().amin(0).lt(1e-9).sum()) >= 8
+    assert float(torch.cdist(points, kept).amin(1).max()) < 0.8
 
 
 def test_a_file_without_evaluations_is_not_written(tmp_path):

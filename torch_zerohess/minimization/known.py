@@ -9,22 +9,22 @@ from torch import Tensor
 from torch_zerohess.evaluators.values import as_tensor
 from torch_zerohess.search.protocol.space import Space
 
+_NEAR = 4.0
+"""Distance from the start in sigmas, root mean square, up to which a point takes the place of a sample."""
+
 
 class Known(NamedTuple):
-    """Evaluations of a caller; the start comes first if it is among them."""
+    """Evaluations of a caller, in the order in which a search is told them."""
 
     points: Tensor
-    """[m, n], in the type of the start."""
+    """[m, n], in the type of the start, which comes first if it is among them. The others come from far to near:
+    searches keep the latest."""
     values: Tensor
     """[m, *out], float64."""
     has_start: bool
-
-    @property
-    def suffice(self) -> bool:
-        """Whether n of them, at different points beside the start, have a value: they take the place of samples."""
-        sound = torch.isfinite(self.values.reshape(len(self.values), -1)).all(1)
-        different = len(torch.unique(self.points[sound], dim=0)) - int(self.has_start)
-        return different >= self.points.shape[1]
+    suffice: bool
+    """Whether n of them, at different points near the start but not at it, have a value. Samples are not needed then.
+    """
 
     @classmethod
     def checked(cls, known: Any, space: Space, *, scalar: bool) -> "Known | None":
@@ -46,11 +46,13 @@ class Known(NamedTuple):
             wanted = f"[{len(points)}]" if scalar else f"[{len(points)}, *out]"
             raise ValueError(f"values of known must have shape {wanted}, one per point, got {list(values.shape)}")
         points = points.to(space.start.dtype)
-        same = (points == space.start).all(1).nonzero()[:, 0]
-        if not len(same):
-            return cls(points, values, False)
-        order = space.start_first(points)
-        return cls(points[order], values[order], True)
+        distance = (space.coordinates(points) - space.coordinates(space.start)).square().mean(1).sqrt()
+        order = distance.argsort(descending=True, stable=True)
+        has_start = bool((points == space.start).all(1).any())
+        if has_start:
+            order = order[space.start_first(points[order])]
+        near = torch.isfinite(values.reshape(len(values), -1)).all(1) & (distance <= _NEAR) & (distance > 0.0)
+        return cls(points[order], values[order], has_start, len(torch.unique(points[near], dim=0)) >= points.shape[1])
 
     def check_same(self, points: Tensor) -> None:
         """Raise ValueError unless these are the points [m, n] that a search began with."""

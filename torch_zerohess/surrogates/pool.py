@@ -119,3 +119,21 @@ def latest(points: Tensor, keep: Tensor | None, count: int) -> Tensor:
         same = (points == keep).all(1).nonzero()[-1:, 0]
         which[: len(same)] = torch.minimum(which[: len(same)], same)
     return which
+
+
+def covering(points: Tensor, keep: Tensor, count: int) -> Tensor:
+    """Return which points [P, n] cover the space, more densely around the point `keep` [n]: at most `count`, in order.
+
+    Each choice has the largest distance, as in `Pool.thin`, from the choices before it. Values do not matter: in noise
+    the lowest ones of many are lucky.
+    """
+    which = torch.arange(len(points), device=points.device)
+    if len(points) <= count:
+        return which
+    away = (points - keep).norm(dim=1) + _CLOSE
+    k, chosen, relative = int(away.argmin()), torch.zeros_like(away, dtype=torch.bool), torch.full_like(away, math.inf)
+    for _ in range(count):
+        chosen[k] = True
+        relative = relative.minimum((points - points[k]).norm(dim=1) / (away + away[k])).masked_fill(chosen, -1.0)
+        k = int(relative.argmax())
+    return which[chosen]

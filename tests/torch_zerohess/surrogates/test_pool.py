@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.surrogates.pool import Pool
+from torch_zerohess.surrogates.pool import Pool, covering
 from truths import vector
 
 
@@ -138,3 +138,18 @@ def test_the_worse_of_the_two_relatively_closest_is_dropped():
 def test_what_is_next_to_the_point_to_keep_is_dropped_before_it():
     """A millionth away from it: no farther than rounding, though relative to its own distance it is far."""
     assert thinned((0.0, 1e-6, 1.0, 1.2), (0.0, -1.0, 2.0, 3.0)) == [0.0, 1.0, 1.2]
+
+
+def test_a_choice_of_points_is_denser_around_one_of_them():
+    """Of points at 1, 1/2, 1/4, ... and twice as many about 1, all of the former and few of the latter."""
+    halves = 0.5 ** torch.arange(8.0, dtype=torch.float64)
+    heap = 1.0 + 1e-3 * torch.arange(1.0, 17.0, dtype=torch.float64)
+    points = torch.cat([heap, torch.zeros(1, dtype=torch.float64), halves])[:, None]
+    which = covering(points, vector(0.0), 9)
+    assert len(which) == 9
+    assert {16, *range(18, 25)} <= set(which.tolist())
+
+
+def test_points_that_are_all_the_same_are_chosen_once_each():
+    assert len(covering(torch.zeros(9, 2), torch.zeros(2), 5).unique()) == 5
+    assert torch.equal(covering(torch.ones(3, 2), torch.ones(2), 5), torch.arange(3))

@@ -24,6 +24,8 @@ _ENOUGH = 4
 """Near evaluations, besides the center, that a model needs at least; n if that is less."""
 _SHARPNESS = 0.1
 """Mean squared distance, in units of sigma^2, within which evaluations weigh the same in a faithful model."""
+_DRAWN = 4.0
+"""Distance of a sample from the center in sigmas, root mean square, beyond which it cannot be drawn from there."""
 _BESIDE = 0.3
 """Spread, over sigma, of samples around the end of a step that are evaluated with it."""
 _HALVING = 0.5
@@ -130,6 +132,8 @@ class SmoothedQuadratics(Method[DescentProgress]):
     def _remembered(self, known: DescentProgress, evaluated: Evaluated) -> DescentProgress:
         new = evaluated.sound
         own, more = new.needed, new.further
+        if known.phase == "start":  # those of the caller's own may be anywhere
+            more = more.those((more.points - known.center).norm(dim=1) <= _DRAWN * known.sigma * math.sqrt(self._n))
         pool = known.pool.add(own.points, own.losses, own.outputs, known.center, known.sigma)
         if len(more):
             trial = known.phase == "trial"

@@ -26,7 +26,7 @@ from torch_zerohess.search.protocol.replaced import replace
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, not_finite
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess, Spectra
 from torch_zerohess.surrogates.kernels import structures
-from torch_zerohess.surrogates.pool import Pool
+from torch_zerohess.surrogates.pool import Pool, covering
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 APART = 0.05
@@ -51,6 +51,8 @@ _EXPANSIONS = 3
 """Expansions of the loss around predicted minima. If none predicts the loss there, the loss itself is modelled."""
 _POOL, _BATCHES = 60, 8
 """Evaluations kept, and batches of several points kept at least, unless `pool` says it."""
+_MOST, _ROOM = 256, 512
+"""Evaluations of the first batch, and of several, that are kept at most: P of them take P^3 operations a step."""
 _WIDEST = 10.0
 """Sigma of the model at the best point, at most."""
 
@@ -70,17 +72,15 @@ class ProcessMethod(Method[Q]):
 
     def take(self, known: Q, evaluated: Evaluated) -> Q:
         """Return the progress after an evaluation."""
-        finite, trial = evaluated.finite, known.phase == "trial"
+        finite, trial, before = evaluated.finite, known.phase == "trial", known.best.point
         known = replace(
             known.told(evaluated, lost=evaluated.lacking),
-            room=max(known.room, _BATCHES * len(evaluated) if evaluated.extra else 0),
+            room=max(known.room, min(_BATCHES * len(evaluated), _ROOM) if evaluated.extra else 0),
             iterations=known.iterations + trial,
         )
-        before = known.best.point
         if self.gives_up(known):
             return known.ended_round(not_finite(known.lost), 0)
-        known = self.remembered(known, evaluated.those(finite))
-        known = self.avoiding(known, evaluated.points[~finite])
+        known = self.avoiding(self.remembered(known, evaluated.those(finite)), evaluated.points[~finite])
         if evaluated.extra:
             known = replace(known, moved=max(known.moved, self._length(known.best.point - before)))
         known = self._settled(known) if trial else known
@@ -111,8 +111,7 @@ class ProcessMethod(Method[Q]):
 
     def more(self, known: Q, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Return points around the first one, and points chosen as if the process was right about those before."""
-        lower, upper = self.settings.lower, self.settings.upper
-        near = count // _EVERY
+        lower, upper, near = self.settings.lower, self.settings.upper, count // _EVERY
         if known.phase == "start" or len(known.pool) < 2:
             around = self.settings.drawn(known.center, 1.0, near, generator)
             return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])
@@ -129,8 +128,7 @@ class ProcessMethod(Method[Q]):
         return torch.stack(every[len(points) :])
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
-        least = min(self.settings.n, self.capacity - 2) + 1
-        best, pool = known.best, known.pool
+        best, pool, least = known.best, known.pool, min(self.settings.n, self.capacity - 2) + 1
         return quadratic_of_pool(best, pool, self.settings.loss, known.shape, least, _WIDEST, pool.normal_weights)
 
     def begun(self) -> Q:
@@ -152,6 +150,8 @@ class ProcessMethod(Method[Q]):
             return known
         capacity = self.capacity if self.settings.pool else max(self.capacity, known.room)
         best, pool = known.best.point, known.pool
+        if not len(pool):
+            new = new.those(covering(new.points, new.points[int(new.losses.argmin())], min(capacity, _MOST)))
         while len(pool) + len(new) > capacity > len(new) and not known.noisy:
             pool = pool.thin(best)
         pool = pool.add(new.points, new.losses, new.outputs, best, 1.0)

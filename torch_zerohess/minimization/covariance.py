@@ -56,6 +56,13 @@ def _inverse(hessian: Tensor, errors: Tensor, names: list[int]) -> Tensor:
             "the Hessian must be positive definite for a covariance, but over its diagonal it has the eigenvalue "
             f"{least:.2g}, mostly along parameter {i}: {_REMEDY.format(i)}"
         )
+    if not bool(torch.isfinite(errors).all()):
+        i = names[int(errors.isinf().int().argmax())]
+        raise ValueError(
+            f"the error of the Hessian must be known for a covariance, but too few evaluations near x vary parameter {i}: "
+            'search on from there by minimize(fn, fit.x, engine="descent", restarts=0, ...), or hold the parameter at '
+            f"its value by fixed=[{i}] if it is at a bound"
+        )
     C = torch.cholesky_inverse(factor) / (size[:, None] * size)
     shares = errors.double() * C.diagonal()
     if not float(shares.max()) < 1.0:

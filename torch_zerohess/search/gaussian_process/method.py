@@ -281,7 +281,9 @@ class ProcessMethod(Method[Q]):
             found = GaussianProcess.fit(pool.points, outputs, noises, None, self._structures)
             noises = noises if found.noise >= HIGH_NOISES[0] else NOISES
         outputs = torch.cat([outputs, outputs[int(pool.values.argmax())].expand(len(holes), -1)])
-        process = GaussianProcess.fit(points, outputs, noises, deviation or None, self._structures, spectra)
+        process = GaussianProcess.fit(
+            points, outputs, noises, deviation or None, self._structures, spectra, stretched=outputs.shape[1] > 1
+        )
         noisy = self.settings.noise > 0.0 or process.noise >= HIGH_NOISES[0]
         return replace(known, noisy=noisy, best=known.record if known.noisy and not noisy else known.best), process
 

@@ -59,9 +59,8 @@ def _inverse(hessian: Tensor, errors: Tensor, names: list[int]) -> Tensor:
     if not bool(torch.isfinite(errors).all()):
         i = names[int(errors.isinf().int().argmax())]
         raise ValueError(
-            f"the error of the Hessian must be known for a covariance, but too few evaluations near x vary parameter {i}: "
-            'search on from there by minimize(fn, fit.x, engine="descent", restarts=0, ...), or hold the parameter at '
-            f"its value by fixed=[{i}] if it is at a bound"
+            "the error of the Hessian must be known for a covariance, but too few evaluations near x vary parameter "
+            f"{i}: give more max_evaluations, or hold it at its value by fixed=[{i}]"
         )
     C = torch.cholesky_inverse(factor) / (size[:, None] * size)
     shares = errors.double() * C.diagonal()

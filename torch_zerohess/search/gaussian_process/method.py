@@ -111,8 +111,7 @@ class ProcessMethod(Method[Q]):
 
     def more(self, known: Q, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Return points around the first one, and points chosen as if the process was right about those before."""
-        lower, upper = self.settings.lower, self.settings.upper
-        near = count // _EVERY
+        lower, upper, near = self.settings.lower, self.settings.upper, count // _EVERY
         if known.phase == "start" or len(known.pool) < 2:
             around = self.settings.drawn(known.center, 1.0, near, generator)
             return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])
@@ -290,10 +289,8 @@ class ProcessMethod(Method[Q]):
     def _judged(self, known: Q, values: Tensor) -> Q:
         """Make the point of the pool with the lowest of values [P] the best one."""
         k = int(values.argmin())
-        if not math.isfinite(values[k]):
-            return known
-        sigma = max(known.sigma, self.settings.tolerance)
-        return replace(known, best=Best(known.pool.points[k], float(values[k]), sigma))
+        best = Best(known.pool.points[k], float(values[k]), max(known.sigma, self.settings.tolerance))
+        return replace(known, best=best) if math.isfinite(best.loss) else known
 
     def _lowest(self, known: Q, model: Callable[[Tensor], Tensor], generator: torch.Generator) -> Tensor:
         """Return the point [n] where the model is lowest; near a minimum that is solved, the minimum itself."""

@@ -22,10 +22,15 @@ _CENTER = 1e6
 
 
 def measure(running: Running) -> None:
-    """Evaluate x and the points around it, unless it is done, too few evaluations are left, or there are no outputs."""
-    x = running.best.x
-    points = _surroundings(running.search, x)
-    if points is not None and len(points) <= running.left and measured(running, x) is None:
+    """Evaluate x and the points around it; once more around a lower one among them.
+
+    Not if it is done, if too few evaluations are left, or if there are no outputs.
+    """
+    for _ in range(2):
+        x = running.best.x
+        points = _surroundings(running.search, x)
+        if points is None or len(points) > running.left or measured(running, x) is not None:
+            return
         running.record.keeps_outputs = True
         running.evaluate(points)
 
@@ -53,11 +58,9 @@ def _surroundings(search: TrustRegion, x: Tensor) -> Tensor | None:
     """Return x [n] and two points beside it along each parameter, within the bounds: [2 n + 1, n]."""
     if search.loss is None or search.engine != "gaussian_process" or len(x) > _MOST:
         return None
-    step, (lower, upper) = torch.diag(_step(search)), search.bounds
+    step = torch.diag(_step(search))
     beside = x.to(step) + torch.cat([torch.zeros_like(step[:1]), step, -step])
-    beside = torch.where(beside > upper, 2.0 * upper - beside, beside)  # mirrored
-    beside = torch.where(beside < lower, 2.0 * lower - beside, beside)
-    return beside.clamp(lower, upper).to(x)
+    return beside.clamp(*search.bounds).to(x)
 
 
 def _step(search: TrustRegion) -> Tensor:

@@ -15,10 +15,10 @@ def response(x):
     return x[:, :1] * TIMES ** x[:, 2:] / (x[:, 1:2] ** x[:, 2:] + TIMES ** x[:, 2:])
 
 
-def fitted(seed, fn=response, **settings):
+def fitted(seed, fn=response, start=(1.5, 3.0, 2.0), **settings):
     data = response(vector(2.0, 4.0, 3.0)[None])[0] + SPREAD * normal(50, seed=seed)
     given = {"sigma": 0.5, "bounds": ([0, 0.1, 0.5], [6, 10, 10]), "seed": seed, **settings}
-    return zh.minimize(fn, [1.5, 3.0, 2.0], loss=lambda y: 0.5 * ((y - data) / SPREAD).square().sum(), **given)
+    return zh.minimize(fn, list(start), loss=lambda y: 0.5 * ((y - data) / SPREAD).square().sum(), **given)
 
 
 @pytest.mark.parametrize("restarts", [None, 0])
@@ -31,6 +31,7 @@ def test_the_covariance_after_a_gaussian_process(seed, restarts):
     assert fit.engine == "gaussian_process"
     torch.testing.assert_close(fit.covariance().diagonal(), torch.linalg.inv(J.mT @ J).diagonal(), rtol=1e-3, atol=0)
     error = (fit.hessian - J.mT @ J).diagonal().abs()
+    assert bool((fit.gradient.abs() < 1e-4 * fit.hessian.diagonal().sqrt()).all())  # x is the minimum
     assert bool((error < fit.standard_errors["hessian_diagonal"]).all())
     assert bool((fit.standard_errors["hessian_diagonal"] < 0.05 * fit.hessian.diagonal()).all())
 
@@ -39,6 +40,13 @@ def test_the_last_evaluations_are_x_and_two_points_along_each_parameter():
     fit = fitted(2)
     step = torch.diag(0.025 * torch.ones(3).double())
     torch.testing.assert_close(fit.points[-7:], fit.x + torch.cat([torch.zeros(1, 3).double(), step, -step]))
+
+
+def test_in_narrow_bounds():
+    """The first parameter is known to a millionth: sigma is half a million times the width."""
+    fit = fitted(2, start=(2.0, 3.0, 2.0), bounds=([2.0, 0.1, 0.5], [2.000001, 10, 10]))
+    J = torch.func.jacrev(lambda x: response(x[None])[0])(fit.x) / SPREAD
+    torch.testing.assert_close(fit.hessian, J.mT @ J, rtol=1e-3, atol=1e-3 * float((J.mT @ J).diagonal().max()))
 
 
 def test_at_a_bound_they_are_within_the_bounds():

@@ -56,6 +56,12 @@ def _inverse(hessian: Tensor, errors: Tensor, names: list[int]) -> Tensor:
             "the Hessian must be positive definite for a covariance, but over its diagonal it has the eigenvalue "
             f"{least:.2g}, mostly along parameter {i}: {_REMEDY.format(i)}"
         )
+    if not bool(torch.isfinite(errors).all()):
+        i = names[int(errors.isinf().int().argmax())]
+        raise ValueError(
+            "the error of the Hessian must be known for a covariance, but too few evaluations near x vary parameter "
+            f"{i}: give more max_evaluations, or hold it at its value by fixed=[{i}]"
+        )
     C = torch.cholesky_inverse(factor) / (size[:, None] * size)
     shares = errors.double() * C.diagonal()
     if not float(shares.max()) < 1.0:

@@ -27,9 +27,16 @@ class Derivatives(NamedTuple):
     sigma: Tensor
 
 
-def quadratic_at(x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor, noise: float) -> Derivatives:
-    """Return the quadratic around x [n] of a search with evaluations [P, n] and [P]."""
-    unit, found = search.unit, _model(x, search, points, losses, noise)
+def quadratic_at(
+    x: Tensor,
+    search: TrustRegion,
+    points: Tensor,
+    losses: Tensor,
+    noise: float,
+    measured: tuple[LocalModel, Tensor] | None = None,
+) -> Derivatives:
+    """Return the quadratic around x [n] of a search with evaluations [P, n] and [P]; or a measured one."""
+    unit, found = search.unit, measured or _model(x, search, points, losses, noise)
     if found is None:
         return Derivatives(None, None, None, unit.to(x))
     model, unit = found[0], unit * found[1]

@@ -5,6 +5,7 @@ import contextlib
 from torch_zerohess.minimization.callback import Callback
 from torch_zerohess.minimization.constant import warn_of_constant
 from torch_zerohess.minimization.failure import failure
+from torch_zerohess.minimization.measured import measure
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.outcome import outcome
 from torch_zerohess.minimization.running import Running
@@ -56,6 +57,8 @@ def _end(running: Running, stopping: Stopping, callback: Callback | None) -> End
             warn_of_constant(running.record, seen)
             seen = running.record.complete
             continue
+        if end[0] == "solved" and not running.noise:
+            measure(running)
         if end[0] != "time":
             running.decide()
         decided = stopping.reason(running)  # in noise the decision may refute the target, or find it reached

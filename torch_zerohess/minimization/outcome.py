@@ -3,6 +3,7 @@
 import torch
 
 from torch_zerohess.minimization.derivatives import is_flat, quadratic_at
+from torch_zerohess.minimization.measured import measured
 from torch_zerohess.minimization.minimum import Minimum, Status
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.stopping import status_of
@@ -14,7 +15,7 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
     search = running.search
     (x, value, error), (points, losses) = running.best, running.record.told
     own = running.record.own
-    around = quadratic_at(x, search, points, losses, running.noise or 0.0)
+    around = quadratic_at(x, search, points, losses, running.noise or 0.0, measured(running, x))
     begun = search.evaluations > 0  # a start whose value it cannot take says nothing of sigma
     equal = running.evaluations if begun and running.record.flat and len(search.unit) < running.evaluations else 0
     success = status in ("target", "solved") or status_of(running, arrived=search.solved) == "solved"

@@ -193,7 +193,7 @@ class Running:
         if not (at_target or self.search.solved or self.search.done or ends or self._looking is not None):
             return False
         self._looking = self.record.evaluations if self._looking is None else self._looking
-        found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)
+        found = noise_at(self.best.x, *self.record.told, self._looking, self.evaluate, self.left)
         if found:
             self.noise, self.search = found, self._again(found, self.best.x)
         self._unmeasured, self._looking = self._unmeasured and found is None, None
@@ -226,7 +226,7 @@ class Running:
         self._deciding = before, allowed
         search, expected = self.search, self._expected_minimum(before).x
         likely = [search.x, search.center, expected] if search.averages else [expected, search.center]
-        found = decide(self._evaluated, self.record, search, likely, before, allowed, self.noise)
+        found = decide(self.evaluate, self.record, search, likely, before, allowed, self.noise)
         if found is not None:
             self._decided = Decision(*found, self.record.evaluations)
         self._deciding = None
@@ -272,7 +272,7 @@ class Running:
         points, losses = self.record.keeping(self.search.untouched, self.search.x)
         return expected_minimum(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
 
-    def _evaluated(self, points: Tensor) -> Tensor:
+    def evaluate(self, points: Tensor) -> Tensor:
         """Return the losses [K] of points [K, n], which are not told to the search."""
         losses = []
         for part in points.split(max(self._batch, self._least - 1)):  # no more at once than in the first batch

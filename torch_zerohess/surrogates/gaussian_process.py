@@ -6,7 +6,8 @@ or additive. The Gaussian kernel suits smooth functions, and the Matern kernel r
 kernel suits parameters that act each by itself. Structure, kernel, length and noise maximise the evidence, the
 likelihood of the outputs (Rasmussen and Williams 2006, section 5.4).
 
-One length serves all parameters. For one length per parameter divide the points by these lengths (`ProcessSurrogate`).
+One length serves all parameters of a loss. With outputs of many elements there is enough evidence for more: the length
+of each parameter is a power of two times the common one. `ProcessSurrogate` has any length for each parameter.
 """
 
 import itertools
@@ -30,6 +31,8 @@ CONSTANT = 1.0
 """Variance of the constant part of the kernel."""
 _SPREAD = 1.5
 """Standard deviation of the prior over the log of a length."""
+_STRETCH, _STRETCHES = 4.0, 2
+"""Length of a parameter over the common one, or its inverse, at most; and steps towards it for each parameter."""
 DEVIATION_DEGREES = 7
 """Degrees of freedom of a deviation that the caller knows: as many as eight values at one point give."""
 _FLAT = 1e-14
@@ -65,6 +68,8 @@ class GaussianProcess:
     structure: Structure
     kernel: Kernel
     length: float
+    stretch: Tensor
+    """Length of each parameter over `length` [n]."""
     mean: Tensor
     """[m]"""
     weights: Tensor
@@ -85,6 +90,8 @@ class GaussianProcess:
         deviation: float | None = None,
         structures: Sequence[Structure] = ("joint",),
         spectra: Spectra | None = None,
+        *,
+        stretched: bool = False,
     ) -> "GaussianProcess":
         """Choose structure, kernel, length and noise from their lists by the evidence; condition on P >= 2 outputs.
 
@@ -95,6 +102,7 @@ class GaussianProcess:
             deviation: standard deviation of repeated outputs at one point, if it is known.
             structures: of the kernel, to choose from.
             spectra: of the same points and structures, if it is known.
+            stretched: whether parameters may have lengths of their own in a joint kernel.
         """
         mean = outputs.mean(0)
         change = outputs - mean
@@ -104,16 +112,19 @@ class GaussianProcess:
         relative = None if deviation is None or flat else deviation / scale
         target = torch.zeros_like(change) if flat else change / scale
         spectra = spectra or Spectra(points, structures)
-        evidence, variances = spectral_evidence(spectra, target, noises, relative)
-        best = int(evidence.argmax())
-        every = itertools.product(structures, KERNELS, LENGTHS, noises)
-        structure, kernel, length, noise = next(itertools.islice(every, best, None))
-        variance = 1.0 if flat else scale**2 * float(variances.flatten()[best])
-        covariance = covariances(structure, kernel, separations(structure, points, points) / length) + CONSTANT
+        (structure, kernel, length, noise), variance = _likeliest(spectra, target, noises, relative)
+        stretch = torch.ones_like(points[0])
+        if stretched and structure == "joint" and len(stretch) > 1 and not flat:
+            stretch = _stretch(points, target, kernel, length, noise)
+        u = points / stretch
+        if not torch.equal(u, points):
+            (_, kernel, length, noise), variance = _likeliest(Spectra(u), target, noises, relative)
+        variance = 1.0 if flat else scale**2 * variance
+        covariance = covariances(structure, kernel, separations(structure, u, u) / length) + CONSTANT
         covariance.diagonal().add_(noise)
         factor = torch.linalg.cholesky(covariance)
         weights = torch.cholesky_inverse(factor) @ change  # of many elements: faster than to solve for each
-        return cls(points, structure, kernel, length, mean, weights, variance, noise, factor)
+        return cls(points, structure, kernel, length, stretch, mean, weights, variance, noise, factor)
 
     def pending(self, x: Tensor) -> "GaussianProcess":
         """Return the process as if its prediction at x [n] had been evaluated.
@@ -134,7 +145,8 @@ class GaussianProcess:
 
     def covariance(self, x: Tensor) -> Tensor:
         """Covariance [Q, P] of points x [Q, n] with the known ones, in units of `variance`."""
-        separation = separations(self.structure, x, self.points) / self.length
+        u, known = x / self.stretch, self.points / self.stretch
+        separation = separations(self.structure, u, known) / self.length
         return covariances(self.structure, self.kernel, separation) + CONSTANT
 
     def uncertainty(self, covariance: Tensor) -> Tensor:
@@ -148,6 +160,40 @@ def grid_evidence(
 ) -> tuple[Tensor, Tensor]:
     """Return `spectral_evidence` of points [P, n] for joint kernels."""
     return spectral_evidence(Spectra(points), change, noises, deviation)
+
+
+def _likeliest(
+    spectra: Spectra, change: Tensor, noises: Sequence[float], deviation: float | None
+) -> tuple[tuple[Structure, Kernel, float, float], float]:
+    """Return structure, kernel, length and noise of the highest `spectral_evidence`, and their variance."""
+    evidence, variances = spectral_evidence(spectra, change, noises, deviation)
+    best = int(evidence.argmax())
+    every = itertools.product(spectra.structures, KERNELS, LENGTHS, noises)
+    return next(itertools.islice(every, best, None)), float(variances.flatten()[best])
+
+
+def _stretch(points: Tensor, change: Tensor, kernel: Kernel, length: float, noise: float) -> Tensor:
+    """Return the lengths of the parameters over a common one [n]. One by one is doubled or halved while it is likelier.
+
+    The evidence is that of `spectral_evidence`, and the prior is one for each length.
+    """
+    P, n = points.shape
+    stretch, gram = torch.ones_like(points[0]), change @ change.mT / (P * change.shape[1])
+    one = torch.eye(n, dtype=points.dtype, device=points.device)
+    factors = 2.0 ** torch.cat([torch.zeros_like(points[:1]), one, -one])  # the first changes nothing
+    for _ in range(_STRETCHES * n):
+        trials = (stretch * factors).clamp(1.0 / _STRETCH, _STRETCH)
+        u = points / (length * trials[:, None])  # [2 n + 1, P, n]
+        covariance = covariances("joint", kernel, separations("joint", u, u)) + CONSTANT
+        covariance.diagonal(dim1=1, dim2=2).add_(noise)
+        factor = torch.linalg.cholesky(covariance)
+        variances = (torch.cholesky_inverse(factor) * gram).sum((1, 2)) + math.ulp(0.0)
+        logs = 2.0 * factor.diagonal(dim1=1, dim2=2).log().sum(1)
+        best = int((-P * variances.log() - logs - improbability(trials).sum(1)).argmax())
+        if best == 0:
+            break
+        stretch = trials[best]
+    return stretch
 
 
 def spectral_evidence(

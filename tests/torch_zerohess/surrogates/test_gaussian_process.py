@@ -62,6 +62,34 @@ def test_the_posterior_is_the_conditional_of_the_joint_normal_distribution(n, st
     torch.testing.assert_close(process.uncertainty(c), process.variance * spread, atol=1e-6 * process.variance, rtol=0)
 
 
+def test_the_posterior_with_a_length_for_each_parameter():
+    """The same formulas at points over the lengths; the second parameter acts twelve times as fast as the first."""
+    points, x = 2 * normal(20, 2), 2 * normal(7, 2, seed=1)
+    outputs = waves(points * vector(0.25, 3.0))
+    process = GaussianProcess.fit(points, outputs, stretched=True)
+    lengths = process.length * process.stretch
+    assert float(lengths[0] / lengths[1]) >= 8.0
+    scaled, at = points / lengths, x / lengths
+    K = by_hand(process.kernel, scaled, scaled) + process.noise * torch.eye(20, dtype=torch.float64)
+    cross, change = by_hand(process.kernel, at, scaled), outputs - outputs.mean(0)
+    expected = outputs.mean(0) + cross @ torch.linalg.solve(K, change)
+    spread = by_hand(process.kernel, at, at).diagonal() - (cross @ torch.linalg.solve(K, cross.mT)).diagonal()
+    c = process.covariance(x)
+    torch.testing.assert_close(process.predict(x), expected, atol=1e-6, rtol=0)
+    assert process.variance == pytest.approx(float((change * torch.linalg.solve(K, change)).mean()), rel=1e-6)
+    torch.testing.assert_close(process.uncertainty(c), process.variance * spread, atol=1e-6 * process.variance, rtol=0)
+
+
+@pytest.mark.parametrize("truth", [(1.0, 1.0), (0.5, 4.0), (4.0, 0.5)])
+def test_lengths_are_those_of_the_process_that_outputs_were_drawn_from(truth):
+    points = 2 * normal(30, 2)
+    outputs = drawn(points, gaussian, vector(*truth), 1e-3, 200)
+    process = GaussianProcess.fit(points, outputs, stretched=True)
+    found = process.length * process.stretch
+    assert bool((found / vector(*truth)).log2().abs().lt(0.6).all())
+    assert torch.equal(GaussianProcess.fit(points, outputs).stretch, torch.ones(2, dtype=torch.float64))
+
+
 def test_known_points_are_predicted_and_certain():
     points = torch.linspace(-3, 3, 15, dtype=torch.float64)[:, None] * vector(1.0, 0.5)
     process = GaussianProcess.fit(points, waves(points))

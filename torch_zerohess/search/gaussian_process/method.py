@@ -281,17 +281,17 @@ class ProcessMethod(Method[Q]):
             found = GaussianProcess.fit(pool.points, outputs, noises, None, self._structures)
             noises = noises if found.noise >= HIGH_NOISES[0] else NOISES
         outputs = torch.cat([outputs, outputs[int(pool.values.argmax())].expand(len(holes), -1)])
-        process = GaussianProcess.fit(points, outputs, noises, deviation or None, self._structures, spectra)
+        process = GaussianProcess.fit(
+            points, outputs, noises, deviation or None, self._structures, spectra, stretched=outputs.shape[1] > 1
+        )
         noisy = self.settings.noise > 0.0 or process.noise >= HIGH_NOISES[0]
         return replace(known, noisy=noisy, best=known.record if known.noisy and not noisy else known.best), process
 
     def _judged(self, known: Q, values: Tensor) -> Q:
         """Make the point of the pool with the lowest of values [P] the best one."""
         k = int(values.argmin())
-        if not math.isfinite(values[k]):
-            return known
-        sigma = max(known.sigma, self.settings.tolerance)
-        return replace(known, best=Best(known.pool.points[k], float(values[k]), sigma))
+        best = Best(known.pool.points[k], float(values[k]), max(known.sigma, self.settings.tolerance))
+        return replace(known, best=best) if math.isfinite(best.loss) else known
 
     def _lowest(self, known: Q, model: Callable[[Tensor], Tensor], generator: torch.Generator) -> Tensor:
         """Return the point [n] where the model is lowest; near a minimum that is solved, the minimum itself."""

@@ -3,6 +3,7 @@
 import functools
 import itertools
 import re
+import statistics
 
 import pytest
 import torch
@@ -31,6 +32,23 @@ def search(fn=swing, solution=SOLUTION, shift=0.0, **settings):
 
 def finishing(found):
     return found.state_dict()["progress"]["finishing"]
+
+
+def test_parameters_of_different_scale_have_lengths_of_their_own():
+    """A spot moves four times as far with one parameter as with the other. One length takes 17.5 evaluations."""
+    pixels, target = torch.linspace(-3.0, 3.0, 24, dtype=torch.float64), vector(4.0, 0.7)[None]
+
+    def spot(x):
+        across, along = (torch.exp(-(((pixels - one[:, None]) / 0.7) ** 2)) for one in (x[:, 0] / 4.0, x[:, 1]))
+        return across[:, :, None] * along[:, None]
+
+    def evaluations(seed):
+        start = vector(-4.0, -1.0) + normal(2, seed=seed)
+        away = lambda image: (image - spot(target)[0]).square().sum()  # noqa: E731
+        box = {"bounds": ([-8.0, -3.0], [8.0, 3.0]), "sigma": 1.0}
+        return zh.minimize(spot, start, loss=away, target=1e-3, seed=seed, max_evaluations=200, **box).evaluations
+
+    assert statistics.median(evaluations(seed) for seed in range(12)) < 16
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,8 @@ class Arrivals:
     """Rounds that have ended, most of them where the search has arrived."""
     lowest: Best | None = None
     """The lowest point at which it has arrived."""
+    polished: bool = True
+    """Whether it is a minimum up to rounding, as far as a model tells. Otherwise only the steps became short there."""
     agreed: int = 0
     """Rounds that have arrived at the best point, or at other points with the same loss, and none at a lower one."""
     higher: int = 0
@@ -113,11 +115,13 @@ class Progress:
             return known
         return replace(known, done=True, message=f"{reason}, in round {known.rounds}")
 
-    def arriving(self: "P", end: Best) -> "P":
-        """Note that the search has arrived."""
+    def arriving(self: "P", end: Best, *, polished: bool = True) -> "P":
+        """Note that the search has arrived; polished: see `Arrivals`."""
         lowest = self.arrivals.lowest
-        lower = end.loss < (math.inf if lowest is None else lowest.loss)
-        return self.with_arrivals(lowest=end) if lower else self
+        before = math.inf if lowest is None else lowest.loss
+        if end.loss < before:
+            return self.with_arrivals(lowest=end, polished=polished)
+        return self.with_arrivals(polished=True) if polished and end.loss == before else self
 
     def agreeing(self: "P", end: Best, tolerance: float, losses: Tensor | None = None) -> "P":
         """Count a round that has arrived.

@@ -23,7 +23,7 @@ from torch_zerohess.search.gaussian_process.finish import PATIENCE, FinishedProc
 from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.replaced import replace
-from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
+from torch_zerohess.search.protocol.state import EQUAL, Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -74,6 +74,18 @@ class OutputProcessProgress(FinishedProgress):
     """Rounds elsewhere since the turn of the process."""
     failures: int = 0
     """Turns of Gauss-Newton in a row that have ended beside their start; after each the process works twice as long."""
+
+    def is_rough_end(self, tolerance: float) -> bool:
+        """Whether Gauss-Newton has failed at the best point by short steps that promised next to nothing.
+
+        The outputs are too rough for them, as those of an adaptive solver. Two losses that differ by so little are the
+        same, see `EQUAL`.
+        """
+        local, best = self.local, self.best
+        if local is None or not local.failed or not local.rejected or not torch.equal(local.lowest.point, best.point):
+            return False
+        same = EQUAL * (float(self.pool.values.quantile(0.25)) - best.loss)
+        return local.sigma < tolerance and local.promised <= same
 
 
 class OutputProcess(FinishedProcess[OutputProcessProgress]):
@@ -250,8 +262,10 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
 
     def _went_on(self, known: OutputProcessProgress) -> OutputProcessProgress:
         """Arrive, or look elsewhere if that is due."""
-        if known.due or (known.is_solved and known.has_looked and known.is_minimum(self.settings.tolerance)):
-            return super().arrived(known, known.due or "nothing lower was found than a minimum of Gauss-Newton")
+        tolerance = self.settings.tolerance
+        ended = known.is_solved or known.is_rough_end(tolerance)
+        if known.due or (ended and known.has_looked and known.is_minimum(tolerance)):
+            return super().arrived(known, known.due or "nothing lower was found than where Gauss-Newton has ended")
         if known.stuck == 0 or known.exploring == 0:
             known = replace(known, looking=False)
         n = self.settings.n

@@ -15,7 +15,7 @@ from torch_zerohess.version import written_by
 T = TypeVar("T")
 _SCALAR = torch.Size()
 
-_EQUAL = 1e-4
+EQUAL = 1e-4
 """Difference between two losses that are the same, over the distance of the lower quartile of all from the lowest."""
 LOST = 10
 """Batches in a row that are lost, after which a round or the search ends."""
@@ -137,7 +137,7 @@ class Progress:
                 if losses are not to be compared.
         """
         best, place, apart = self.best, self.arrivals.place, self.arrivals.apart
-        slack = -math.inf if losses is None else _EQUAL * (float(losses.quantile(0.25)) - best.loss)
+        slack = -math.inf if losses is None else EQUAL * (float(losses.quantile(0.25)) - best.loss)
 
         def is_best(one: Best) -> bool:
             return are_same(one.point, best.point, tolerance) or one.loss - best.loss <= slack

@@ -45,6 +45,8 @@ _ELSEWHERE = 2
 """Rounds of Gauss-Newton from random points in a row, before it is the turn of the process."""
 _HIGHER = 0.01
 """A round ends where it promises less than this part of its distance from the lowest loss."""
+_ROUGH = 0.01
+"""Part of the loss, at most, that rough outputs add to it or take away next to the end of Gauss-Newton."""
 _ARRIVAL = "steps of Gauss-Newton have arrived"
 
 
@@ -76,16 +78,16 @@ class OutputProcessProgress(FinishedProgress):
     """Turns of Gauss-Newton in a row that have ended beside their start; after each the process works twice as long."""
 
     def is_rough_end(self, tolerance: float) -> bool:
-        """Whether Gauss-Newton has failed at the best point by short steps that promised next to nothing.
+        """Whether the last step of Gauss-Newton was short, promised next to nothing, and lost next to nothing.
 
-        The outputs are too rough for them, as those of an adaptive solver. Two losses that differ by so little are the
-        same, see `EQUAL`.
+        Gauss-Newton then fails because outputs are rough, as those of an adaptive solver, and not because they jump.
+        Next to nothing is a difference of losses that are the same (`EQUAL`), and a small part of the loss.
         """
         local, best = self.local, self.best
-        if local is None or not local.failed or not local.rejected or not torch.equal(local.lowest.point, best.point):
+        if local is None or not local.failed or local.lost or not torch.equal(local.lowest.point, best.point):
             return False
-        same = EQUAL * (float(self.pool.values.quantile(0.25)) - best.loss)
-        return local.sigma < tolerance and local.promised <= same
+        same = min(EQUAL * (float(self.pool.values.quantile(0.25)) - best.loss), _ROUGH * abs(best.loss))
+        return local.sigma < tolerance and max(local.promised, float(local.values[-1]) - best.loss) <= same
 
 
 class OutputProcess(FinishedProcess[OutputProcessProgress]):

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.optimize import linprog
 
-from truths import vector
+from truths import normal, vector
 
 TARGET = vector(3.0, -1.0)
 CURVATURE = torch.tensor([[2.0, 0.6], [0.6, 5.0]], dtype=torch.float64)
@@ -201,3 +201,20 @@ class Linear:
     def excess(self, value):
         """Loss above the least one, over that of the start at zero."""
         return (value - self.least) / (float(self.loss(torch.zeros_like(self.target))) - self.least)
+
+
+def hill_fit(seed):
+    """Return an output of three parameters, its misfit to noisy data, a random start, and the box that it is in."""
+    t = torch.linspace(0.0, 10.0, 50, dtype=torch.float64)
+    lower, upper = vector(0.0, 0.1, 0.5), vector(6.0, 10.0, 10.0)
+
+    def hill(x):
+        return x[:, :1] * t ** x[:, 2:] / (x[:, 1:2] ** x[:, 2:] + t ** x[:, 2:])
+
+    measured = hill(vector(2.0, 4.0, 3.0)[None])[0] + 0.02 * normal(50, seed=0)
+
+    def loss(output):
+        return 0.5 * ((output - measured) / 0.02).square().sum()
+
+    start = torch.rand(3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return hill, loss, lower + (upper - lower) * start, (lower, upper)

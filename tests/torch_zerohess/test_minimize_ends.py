@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from searches import TARGET, raising, tilted, zeros
+from searches import TARGET, hill_fit, raising, tilted, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators.returned import ReturnedError
@@ -194,6 +194,20 @@ def test_every_engine_knows_both_tolerances(engine, n, whole, name):
     assert name in fit.message or fit.message == "the search has arrived at x"
     assert fit.evaluations < 0.6 * without.evaluations
     assert fit.value < 1e-2
+
+
+@pytest.mark.parametrize("name", ["xtol", "ftol"])
+@pytest.mark.parametrize("seed", [1, 10])
+def test_a_tolerance_ends_nothing_where_steps_became_short_far_from_a_minimum(name, seed):
+    """Steps of a Gaussian process do before Gauss-Newton has begun. Truth: a Newton step from x."""
+    hill, loss, start, bounds = hill_fit(seed)
+    fit = zh.minimize(hill, start, sigma=0.5, bounds=bounds, loss=loss, seed=seed, **{name: 1e-9})
+    assert fit.success
+
+    def whole(x):
+        return loss(hill(x[None])[0])
+
+    assert float(torch.linalg.solve(torch.func.hessian(whole)(fit.x), torch.func.grad(whole)(fit.x)).norm()) < 1e-5
 
 
 def test_a_tolerance_ends_nothing_before_it_has_begun():

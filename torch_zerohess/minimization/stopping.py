@@ -56,7 +56,7 @@ class Stopping:
             return status_of(running, arrived=True), f"the region is within xtol ({self.xtol}) of x"
         if self.ftol is not None and search.promise <= self.ftol:
             return status_of(running, arrived=True), f"the model promises a decrease of at most ftol ({self.ftol})"
-        if search.solved and (self.xtol, self.ftol) != (None, None):
+        if search.solved and search.polished and (self.xtol, self.ftol) != (None, None):
             return status_of(running, arrived=True), "the search has arrived at x"
         if self.agrees and not running.noise and _agree(running):
             where = "points with the loss at x: the minimum is not unique" if search.apart else "x"

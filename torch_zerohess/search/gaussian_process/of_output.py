@@ -23,7 +23,7 @@ from torch_zerohess.search.gaussian_process.finish import PATIENCE, FinishedProc
 from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.replaced import replace
-from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
+from torch_zerohess.search.protocol.state import EQUAL, Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -45,6 +45,8 @@ _ELSEWHERE = 2
 """Rounds of Gauss-Newton from random points in a row, before it is the turn of the process."""
 _HIGHER = 0.01
 """A round ends where it promises less than this part of its distance from the lowest loss."""
+_ROUGH = 0.01
+"""Part of the loss, at most, that rough outputs add to it or take away next to the end of Gauss-Newton."""
 _ARRIVAL = "steps of Gauss-Newton have arrived"
 
 
@@ -74,6 +76,18 @@ class OutputProcessProgress(FinishedProgress):
     """Rounds elsewhere since the turn of the process."""
     failures: int = 0
     """Turns of Gauss-Newton in a row that have ended beside their start; after each the process works twice as long."""
+
+    def is_rough_end(self, tolerance: float) -> bool:
+        """Whether the last step of Gauss-Newton was short, promised next to nothing, and lost next to nothing.
+
+        Gauss-Newton then fails because outputs are rough, as those of an adaptive solver, and not because they jump.
+        Next to nothing is a difference of losses that are the same (`EQUAL`), and a small part of the loss.
+        """
+        local, best = self.local, self.best
+        if local is None or not local.failed or local.lost or not torch.equal(local.lowest.point, best.point):
+            return False
+        same = min(EQUAL * (float(self.pool.values.quantile(0.25)) - best.loss), _ROUGH * abs(best.loss))
+        return local.sigma < tolerance and max(local.promised, float(local.values[-1]) - best.loss) <= same
 
 
 class OutputProcess(FinishedProcess[OutputProcessProgress]):
@@ -250,8 +264,10 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
 
     def _went_on(self, known: OutputProcessProgress) -> OutputProcessProgress:
         """Arrive, or look elsewhere if that is due."""
-        if known.due or (known.is_solved and known.has_looked and known.is_minimum(self.settings.tolerance)):
-            return super().arrived(known, known.due or "nothing lower was found than a minimum of Gauss-Newton")
+        tolerance = self.settings.tolerance
+        ended = known.is_solved or known.is_rough_end(tolerance)
+        if known.due or (ended and known.has_looked and known.is_minimum(tolerance)):
+            return super().arrived(known, known.due or "nothing lower was found than where Gauss-Newton has ended")
         if known.stuck == 0 or known.exploring == 0:
             known = replace(known, looking=False)
         n = self.settings.n

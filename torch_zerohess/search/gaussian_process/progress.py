@@ -58,7 +58,7 @@ class ProcessProgress(Progress):
         """
         found = self.is_minimum(tolerance)
         if found or (self.noisy and not self.is_on_plateau(tolerance)):
-            self = self.arriving(self.best)
+            self = self.arriving(self.best, polished=self.noisy or self.is_solved)
         if not found:  # a plateau, or no minimum of the quadratics
             return self
         known = self.agreeing(end or self.best, tolerance, self.pool.values)

@@ -93,6 +93,11 @@ class Standing(ABC, Generic[P]):
         return self._state.progress.is_at_arrival(self._method.settings.tolerance)
 
     @property
+    def polished(self) -> bool:
+        """Whether that minimum is known up to rounding, as far as a model tells; otherwise steps became short there."""
+        return self._state.progress.arrivals.polished
+
+    @property
     def agreed(self) -> int:
         """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
         return self._state.progress.agreed

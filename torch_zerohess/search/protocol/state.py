@@ -15,7 +15,7 @@ from torch_zerohess.version import written_by
 T = TypeVar("T")
 _SCALAR = torch.Size()
 
-_EQUAL = 1e-4
+EQUAL = 1e-4
 """Difference between two losses that are the same, over the distance of the lower quartile of all from the lowest."""
 LOST = 10
 """Batches in a row that are lost, after which a round or the search ends."""
@@ -46,6 +46,8 @@ class Arrivals:
     """Rounds that have ended, most of them where the search has arrived."""
     lowest: Best | None = None
     """The lowest point at which it has arrived."""
+    polished: bool = True
+    """Whether it is a minimum up to rounding, as far as a model tells. Otherwise only the steps became short there."""
     agreed: int = 0
     """Rounds that have arrived at the best point, or at other points with the same loss, and none at a lower one."""
     higher: int = 0
@@ -113,11 +115,13 @@ class Progress:
             return known
         return replace(known, done=True, message=f"{reason}, in round {known.rounds}")
 
-    def arriving(self: "P", end: Best) -> "P":
-        """Note that the search has arrived."""
+    def arriving(self: "P", end: Best, *, polished: bool = True) -> "P":
+        """Note that the search has arrived; polished: see `Arrivals`."""
         lowest = self.arrivals.lowest
-        lower = end.loss < (math.inf if lowest is None else lowest.loss)
-        return self.with_arrivals(lowest=end) if lower else self
+        before = math.inf if lowest is None else lowest.loss
+        if end.loss < before:
+            return self.with_arrivals(lowest=end, polished=polished)
+        return self.with_arrivals(polished=True) if polished and end.loss == before else self
 
     def agreeing(self: "P", end: Best, tolerance: float, losses: Tensor | None = None) -> "P":
         """Count a round that has arrived.
@@ -133,7 +137,7 @@ class Progress:
                 if losses are not to be compared.
         """
         best, place, apart = self.best, self.arrivals.place, self.arrivals.apart
-        slack = -math.inf if losses is None else _EQUAL * (float(losses.quantile(0.25)) - best.loss)
+        slack = -math.inf if losses is None else EQUAL * (float(losses.quantile(0.25)) - best.loss)
 
         def is_best(one: Best) -> bool:
             return are_same(one.point, best.point, tolerance) or one.loss - best.loss <= slack

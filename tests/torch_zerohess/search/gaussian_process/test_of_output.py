@@ -7,7 +7,7 @@ import statistics
 
 import pytest
 import torch
-from searches import Linear, misfit, waves, zeros
+from searches import Linear, hill_fit, misfit, waves, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.optim import GaussianProcessSearch
@@ -493,3 +493,51 @@ def test_no_round_begins_at_a_random_point_before_gauss_newton_has_arrived():
     while found.evaluations < 150:
         found.tell(steps(found.ask()))
         assert len(found.ask()) == 1  # five points would be the start of a round
+
+
+def decays_and_saturates(x):
+    t = torch.logspace(-2.0, 2.0, 40, dtype=torch.float64)
+    return 10 ** x[:, :1] * torch.exp(-(10 ** x[:, 1:2]) * t) + 10 ** x[:, 2:] * t / (1.0 + t)
+
+
+@pytest.mark.parametrize("roughness", [3e-6, 1e-5, 1e-4])
+def test_it_ends_where_outputs_are_rough(roughness):
+    """As those of an adaptive solver: Gauss-Newton then fails next to the minimum. Truth: the smooth function."""
+    truth = vector(0.3, -0.5, -0.2)
+    measured = decays_and_saturates(truth[None])[0] + 0.02 * normal(40, seed=0)
+
+    def rough(x):
+        smooth = decays_and_saturates(x)
+        return smooth + roughness * torch.sin(1e7 * x.sum(1, keepdim=True) * torch.arange(1.0, 41.0).to(x))
+
+    def loss(output):
+        return 0.5 * ((output - measured) / 0.02).square().sum()
+
+    for seed in range(3):
+        fit = zh.minimize(
+            rough, vector(-1.0, 1.0, 0.5), sigma=1.0, bounds=(-3.0, 3.0), loss=loss, restarts=0, seed=seed
+        )
+        assert fit.success
+        assert fit.evaluations < 300
+
+        def whole(x):
+            return loss(decays_and_saturates(x[None])[0])
+
+        gradient, hessian = torch.func.grad(whole)(fit.x), torch.func.hessian(whole)(fit.x)
+        assert float(gradient @ torch.linalg.solve(hessian, gradient)) < 1e-2 * fit.value
+
+
+def test_it_does_not_end_where_outputs_jump():
+    """Steps that promise little may end beyond a jump, with another minimum elsewhere."""
+    hill, loss, start, bounds = hill_fit(101)
+    fit = zh.minimize(
+        lambda x: hill(x) + 3.0 * (x[:, :1] > 1.98),
+        start,
+        sigma=1.0,
+        bounds=bounds,
+        loss=loss,
+        restarts=0,
+        seed=1,
+        max_evaluations=250,
+    )
+    assert not fit.success

@@ -194,3 +194,14 @@ def test_a_state_of_another_search(n, changes, message):
 def test_a_search_is_at_an_arrival_where_its_best_point_is_one(best, rounds, expected):
     arrivals = Arrivals(rounds=rounds, lowest=Best(vector(1.0, 1.0), 2.0))
     assert Progress(best=best, center=best.point, arrivals=arrivals).is_at_arrival(1e-3) is expected
+
+
+def test_an_arrival_is_polished_if_the_lowest_one_is():
+    first, lower = Best(vector(0.0), 2.0), Best(vector(1.0), 1.0)
+    rough = Progress(best=first, center=first.point).arriving(first, polished=False)
+    assert not rough.arrivals.polished
+    assert rough.arriving(first).arrivals.polished
+    assert rough.arriving(lower).arrivals.polished
+    assert not rough.arriving(Best(lower.point, 3.0)).arrivals.polished
+    assert not rough.arriving(first).arriving(lower, polished=False).arrivals.polished
+    assert rough.arriving(first).arriving(first, polished=False).arrivals.polished

@@ -25,7 +25,8 @@ values of skewed noise is that small more often."""
 _CONTRADICTION = 3.0
 """Standard errors by which a mean must be below the mean of a point that is trusted: several points are compared."""
 _DOUBT = 2.0
-"""Standard errors by which another mean must be below that of the chosen point to get the last evaluations."""
+"""Standard errors by which another mean must be below that of the chosen point to get the last evaluations, and to be
+chosen with them."""
 
 
 def differs(one: Tensor, other: Tensor, rounding: float = _ROUNDING) -> bool:
@@ -132,8 +133,8 @@ def lowest_mean(
 
     The first half of the evaluations chooses: all remaining points get the same number, then the better half remains
     (successive halving: Karnin, Koren and Somekh 2013). The second half are at the chosen point. After half of these,
-    the last point that was not chosen is compared again. If its mean is lower by two standard errors, it gets the rest.
-    It is then chosen if its mean is lower by three.
+    the best of the other points is compared again. If its mean is lower by two standard errors, it gets the rest. If
+    that is so with the rest, too, it is chosen.
 
     Only the second half enters the mean, because the values by which a point was chosen are too low on average. If no
     value of the second half is finite, the mean is over the first half; None if no value of the first half is finite,

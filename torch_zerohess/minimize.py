@@ -144,8 +144,10 @@ def minimize(
             be the same everywhere. In noise, an eighth of `max_evaluations` (4 to 48) is kept for the end: the best
             candidates are evaluated again. With up to 40 parameters the minimum of a regression on all evaluations is
             the first candidate. It is x unless the mean at another candidate is lower by three standard errors.
-            Without a regression, x is the candidate with the lowest mean. `value` is the mean at x and `value_error`
-            its standard error. No call of fn has a point twice, because noise may be the same for all points of a call:
+            Without a regression, x is the candidate with the lowest mean. Two candidates are compared again at the end,
+            where two standard errors are enough. Noise may be less at the candidates than at x0: then these errors are
+            from what was measured at the candidates, with Student's t. `value` is the mean at x and `value_error` its
+            standard error. No call of fn has a point twice, because noise may be the same for all points of a call:
             repeated points are evaluated at once only in several processes.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not

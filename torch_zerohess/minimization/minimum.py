@@ -47,7 +47,8 @@ class Minimum:
             x0. Some parameters may stay at x0; the message says which. Then x is the best point with these values.
         value: the loss at x. In noise it is the mean of evaluations at x that were made for it. If the search was
             interrupted before them, it is the prediction of a Gaussian process of all evaluations.
-        value_error: standard error of `value`; 0 without noise.
+        value_error: standard error of `value`; 0 without noise. It is from `noise`, unless evaluations at x show more
+            noise there, or significantly less.
         gradient: [n], of a quadratic around x of width `sigma`; in noise, of a quadratic plus a Gaussian process, at x.
             None if too few evaluations lie around x.
         hessian: [n, n], of the same function; None likewise. With `loss` it may be J^T H J, with the Jacobian J of the

@@ -24,6 +24,9 @@ _SIGNIFICANT = 3.0
 values of skewed noise is that small more often."""
 _CONTRADICTION = 3.0
 """Standard errors by which a mean must be below the mean of a point that is trusted: several points are compared."""
+_DOUBT = 2.0
+"""Standard errors by which another mean must be below that of the chosen point to get the last evaluations, and to be
+chosen with them."""
 
 
 def differs(one: Tensor, other: Tensor, rounding: float = _ROUNDING) -> bool:
@@ -129,9 +132,13 @@ def lowest_mean(
     """Evaluate points [C, n] again; return which has the lowest mean, and its mean and standard error.
 
     The first half of the evaluations chooses: all remaining points get the same number, then the better half remains
-    (successive halving: Karnin, Koren and Somekh 2013). The second half are all at the chosen point. Only the second
-    half enters the mean, because the values by which a point was chosen are too low on average. If no value of the
-    second half is finite, the mean is over the first half; None if no value of the first half is finite, either.
+    (successive halving: Karnin, Koren and Somekh 2013). The second half are at the chosen point. After half of these,
+    the best of the other points is compared again. If its mean is lower by two standard errors, it gets the rest. If
+    that is so with the rest, too, it is chosen.
+
+    Only the second half enters the mean, because the values by which a point was chosen are too low on average. If no
+    value of the second half is finite, the mean is over the first half; None if no value of the first half is finite,
+    either.
 
     Args:
         evaluate: points [K, n] -> losses [K].
@@ -140,11 +147,11 @@ def lowest_mean(
         noise: standard deviation of a loss. What is measured at the chosen point takes its place if that is larger, or
             significantly smaller: a loss of noisy outputs has less noise where it is lower.
         trusted: whether a model of many evaluations has chosen the first point. Another point then takes its place only
-            if the mean is lower by three standard errors of the difference.
+            if the mean is lower by three standard errors of the difference, see `_bound`.
     """
     left, choosing = torch.arange(len(points), device="cpu"), evaluations // 2
     losses = torch.zeros(len(points), 0, dtype=torch.float64, device="cpu")  # of those that are left
-    rounds = math.ceil(math.log2(len(points)))
+    rounds, rival = math.ceil(math.log2(len(points))), None
     for k in range(rounds):
         each = choosing // ((rounds - k) * len(left))
         if each:
@@ -153,16 +160,61 @@ def lowest_mean(
             losses = torch.cat([losses, torch.where(torch.isfinite(repeated), repeated, torch.inf)], 1)
             means = losses.mean(1)
             if trusted:
-                means[left == 0] -= _CONTRADICTION * noise * math.sqrt(2.0 / losses.shape[1])
-            better = means.argsort()[: math.ceil(len(left) / 2)]
+                means[left == 0] -= _bound([*losses], noise, _CONTRADICTION) * math.sqrt(2.0 / losses.shape[1])
+            order = means.argsort()
+            rival = (int(left[order[1]]), losses[order[1]]) if len(left) > 1 else None
+            better = order[: math.ceil(len(left) / 2)]
             left, losses = left[better], losses[better]
-    repeated = evaluate(points[left[:1]].repeat(evaluations, 1))
-    repeated, earlier = (one[torch.isfinite(one)] for one in (repeated, losses[0]))
+    chosen, earlier, first = int(left[0]), losses[0], evaluations // 2 if rival else evaluations
+    repeated = evaluate(points[[chosen]].repeat(first, 1)).to(losses)
+    if rival:
+        doubted = _is_lower(rival[1], torch.cat([earlier, repeated]), noise, _DOUBT)
+        last = evaluate(points[[rival[0] if doubted else chosen]].repeat(evaluations - first, 1)).to(losses)
+        if not doubted:
+            repeated = torch.cat([repeated, last])
+        elif _is_lower(torch.cat([rival[1], last]), torch.cat([earlier, repeated]), noise, _DOUBT):
+            (chosen, earlier), repeated = rival, last
+    repeated, earlier = (one[torch.isfinite(one)] for one in (repeated, earlier))
     if not len(repeated):
         repeated, earlier = earlier, repeated
     if not len(repeated):
         return None
-    return int(left[0]), float(repeated.mean()), _spread([repeated, earlier], noise) / math.sqrt(len(repeated))
+    return chosen, float(repeated.mean()), _spread([repeated, earlier], noise) / math.sqrt(len(repeated))
+
+
+def _is_lower(values: Tensor, others: Tensor, noise: float, errors: float) -> bool:
+    """Whether the mean of values [K] is lower than that of others [L] by a number of standard errors."""
+    groups = [one[torch.isfinite(one)] for one in (values, others)]
+    apart = float(groups[1].mean() - groups[0].mean())  # NaN without a value
+    return apart > _bound(groups, noise, errors) * math.sqrt(sum(1.0 / max(len(one), 1) for one in groups))
+
+
+def _bound(groups: Sequence[Tensor], noise: float, errors: float) -> float:
+    """Return what a number of standard errors is for one value of groups [K], if the deviation may be below `noise`.
+
+    The deviation in the groups counts if it is larger, or if it is smaller by more than the errors of so few values:
+    Wallace (1959) gives the number for Student's t. Equal values tell no deviation.
+    """
+    measured, freedom = _pooled(groups, noise)
+    bound = errors * max(noise, measured)
+    if measured == 0.0:
+        return bound
+    exponent = (errors * (8 * freedom + 3) / (8 * freedom + 1)) ** 2 / freedom
+    return min(bound, math.sqrt(freedom * math.expm1(exponent)) * measured)
+
+
+def _pooled(groups: Sequence[Tensor], noise: float) -> tuple[float, int]:
+    """Return the standard deviation of the finite values in groups [K] of different means, and its degrees of freedom.
+
+    The deviation is 0 if there are no degrees of freedom. Squares of what is far below the noise may vanish.
+    """
+    groups = [one[torch.isfinite(one)] for one in groups]
+    freedom = sum(len(one) - 1 for one in groups if len(one))
+    if freedom == 0:
+        return 0.0, 0
+    apart = [one - one[0] for one in groups if len(one)]  # exactly 0 where values are equal, as their mean is not
+    size = max(noise, *(float(one.abs().max()) for one in apart)) or 1.0  # squares over it do not overflow
+    return math.sqrt(sum(float((one - one.mean()).div(size).square().sum()) for one in apart) / freedom) * size, freedom
 
 
 def _spread(groups: Sequence[Tensor], noise: float) -> float:
@@ -171,12 +223,7 @@ def _spread(groups: Sequence[Tensor], noise: float) -> float:
     Paulson (1942) gives a normal number with the probability of a ratio of two variances that are equal in truth. The
     variance `noise`^2 is taken for a measured one.
     """
-    freedom = sum(len(one) - 1 for one in groups if len(one))
-    if freedom == 0:
-        return noise
-    apart = [one - one[0] for one in groups if len(one)]  # exactly 0 where values are equal, as their mean is not
-    size = max(noise, *(float(one.abs().max()) for one in apart)) or 1.0  # squares over it do not overflow
-    measured = math.sqrt(sum(float((one - one.mean()).div(size).square().sum()) for one in apart) / freedom) * size
+    measured, freedom = _pooled(groups, noise)
     if measured == 0.0 or measured >= noise:
         return max(noise, measured)
     ratio, own, other = (measured / noise) ** (2 / 3), 2 / (9 * freedom), 2 / (9 * (REPEATED - 1))

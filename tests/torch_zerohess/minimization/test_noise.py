@@ -86,7 +86,7 @@ def test_values_that_are_equal_do_not_tell_the_noise(level):
     for evaluations in (14, 40):
         _, value, error = lowest_mean(constant, torch.stack([TARGET, zeros(2)]), evaluations, 0.3)
         assert value == pytest.approx(level)
-        assert error == 0.3 / math.sqrt(len(constant.points[-1]))
+        assert error == 0.3 / math.sqrt(sum(map(len, constant.points[-2:])))
 
 
 def test_the_value_is_unbiased_and_its_error_true():

@@ -264,9 +264,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
 
     def _went_on(self, known: OutputProcessProgress) -> OutputProcessProgress:
         """Arrive, or look elsewhere if that is due."""
-        tolerance = self.settings.tolerance
-        ended = known.is_solved or known.is_rough_end(tolerance)
-        if known.due or (ended and known.has_looked and known.is_minimum(tolerance)):
+        ended = known.is_solved or known.is_rough_end(self.settings.tolerance)
+        if known.due or (ended and known.has_looked and known.is_minimum(self.settings.tolerance)):
             return super().arrived(known, known.due or "nothing lower was found than where Gauss-Newton has ended")
         if known.stuck == 0 or known.exploring == 0:
             known = replace(known, looking=False)

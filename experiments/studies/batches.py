@@ -9,7 +9,7 @@ Runs of one start take turns, so that whatever else the machine does falls on al
 import statistics
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import astuple, dataclass
 from typing import Literal
 
@@ -98,17 +98,16 @@ def batches(
     torch.set_num_threads(1)
     ways = [(size, count) for size in sizes for count in ((0,) if size == 1 or not workers else (0, workers))]
     rows = []
-    with ExitStack() as stack:
-        pool = stack.enter_context(ProcessPool(workers)) if workers else None
-        for name in progress(names, "tasks"):
-            task, spread = catalogue.fitting(name), Factory(images_of, name)
+    for name in progress(names, "tasks"):
+        task, spread = catalogue.fitting(name), Factory(images_of, name)
+        with ProcessPool(workers) if workers else nullcontext() as pool:  # of one task: workers keep their scenes
             found = [
                 [_search(task, spread, run, batch, pool if count else None, evaluations) for batch, count in ways]
                 for run in range(seed, seed + runs)
             ]
-            rows += _rows(name, ways, found)
-            if task.renderer is not None:  # two loaded scenes slow each other down
-                task.renderer.release()
+        rows += _rows(name, ways, found)
+        if task.renderer is not None:  # two loaded scenes slow each other down
+            task.renderer.release()
     result_files.show(HEADERS, [list(astuple(row)) for row in rows], store)
     return rows
 

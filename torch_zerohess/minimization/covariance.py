@@ -33,7 +33,7 @@ def _free(fixed: Sequence[int], n: int) -> Tensor:
         raise TypeError(f"fixed must be a list of numbers of parameters, as [0], got {fixed!r}")
     numbers = [checked_integer("fixed", one) for one in fixed]
     if wrong := [one for one in numbers if not -n <= one < n]:
-        raise ValueError(f"fixed must be numbers of the {n} parameters, from 0 to {n - 1}, got {wrong[0]}")
+        raise ValueError(f"fixed must be numbers of the {n} parameters, from {-n} to {n - 1}, got {wrong[0]}")
     held = {one % n for one in numbers}
     if len(held) == n:
         raise ValueError(f"fixed must leave a parameter whose covariance is sought, got all {n}")

@@ -33,7 +33,7 @@ def quadratic_at(
     points: Tensor,
     losses: Tensor,
     noise: float,
-    measured: tuple[LocalModel, Tensor] | None = None,
+    measured: tuple[LocalModel, float] | None = None,
 ) -> Derivatives:
     """Return the quadratic around x [n] of a search with evaluations [P, n] and [P]; or a measured one."""
     unit, found = search.unit, measured or _model(x, search, points, losses, noise)

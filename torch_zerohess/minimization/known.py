@@ -28,7 +28,7 @@ class Known(NamedTuple):
 
     @classmethod
     def checked(cls, known: Any, space: Space, *, scalar: bool) -> "Known | None":
-        """Return what a caller gave for the parameters of a space; None if that is no point.
+        """Return what a caller gave for the parameters of a space; None if there are no points.
 
         scalar: whether each value must be one number.
 

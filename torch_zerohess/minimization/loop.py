@@ -5,7 +5,7 @@ import contextlib
 from torch_zerohess.minimization.callback import Callback
 from torch_zerohess.minimization.constant import warn_of_constant
 from torch_zerohess.minimization.failure import failure
-from torch_zerohess.minimization.measured import measure
+from torch_zerohess.minimization.measured_derivatives import measure
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.outcome import outcome
 from torch_zerohess.minimization.running import Running

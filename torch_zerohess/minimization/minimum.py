@@ -106,17 +106,16 @@ class Minimum:
 
         Args:
             fixed: numbers of parameters that are held at their values in x, such as one that the data do not determine,
-                or one that takes whole numbers only. The covariance is that of the others for these values: their rows
-                and columns in the inverse of the Hessian without the fixed ones. Rows and columns of fixed parameters
-                are 0.
+                or one that takes whole numbers only. The covariance of the others is the inverse of the Hessian
+                without the rows and columns of fixed parameters. Rows and columns of fixed parameters are 0.
 
         The loss must be the negative logarithm of the likelihood, or of the posterior density. For residuals r with
         independent Gaussian errors of standard deviation s it is sum(r^2 / s^2) / 2. The standard deviations of the
         parameters are the roots of the diagonal. An error d of H_ii, from `standard_errors`, changes variance i by the
         share d C_ii, to first order.
 
-        Raises ValueError if the Hessian is not known, if that of the parameters that are not fixed is not positive
-        definite within its errors, or if `fixed` has no numbers of parameters, or all of them.
+        Raises ValueError if the Hessian is not known, or is not positive definite within its errors without the fixed
+        parameters; if `fixed` has another number than those of parameters, or the numbers of all.
 
         Example:
             >>> from torch_zerohess import minimize

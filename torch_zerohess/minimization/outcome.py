@@ -3,7 +3,7 @@
 import torch
 
 from torch_zerohess.minimization.derivatives import is_flat, quadratic_at
-from torch_zerohess.minimization.measured import measured
+from torch_zerohess.minimization.measured_derivatives import measured
 from torch_zerohess.minimization.minimum import Minimum, Status
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.stopping import status_of

@@ -113,7 +113,7 @@ def test_a_parameter_that_is_not_determined_may_be_fixed() -> None:
 @pytest.mark.parametrize(
     ("fixed", "error", "message"),
     [
-        ([2], ValueError, "fixed must be numbers of the 2 parameters, from 0 to 1, got 2"),
+        ([2], ValueError, "fixed must be numbers of the 2 parameters, from -2 to 1, got 2"),
         ([0, 1], ValueError, "fixed must leave a parameter whose covariance is sought, got all 2"),
         (0, TypeError, r"fixed must be a list of numbers of parameters, as \[0\], got 0"),
         ("0", TypeError, "fixed must be a list of numbers of parameters"),

@@ -25,7 +25,7 @@ class Fitted(NamedTuple):
     size: float
     """Of the losses."""
     shared: Interpolation
-    """Of the points."""
+    """What depends on the points alone."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,9 +43,8 @@ class TransformedQuadratics(MetricQuadratics):
         )
 
     def predicted(self, known: MetricProgress, x: Tensor) -> float:
-        return self._expected(
-            super()._quadratic(known, self._fitted_to(known)), x
-        )  # by a quadratic of the losses: it is fitted faster
+        plain = super()._quadratic(known, self._fitted_to(known))  # it is fitted faster than one of transformed losses
+        return self._expected(plain, x)
 
     def _quadratic(self, known: MetricProgress, fitted: Fitted) -> MetricProgress:
         known = super()._quadratic(known, fitted)

@@ -81,7 +81,7 @@ class OutputProcessProgress(FinishedProgress):
         """Whether the last step of Gauss-Newton was short, promised next to nothing, and lost next to nothing.
 
         Gauss-Newton then fails because outputs are rough, as those of an adaptive solver, and not because they jump.
-        Next to nothing is a difference of losses that are the same (`EQUAL`), and a small part of the loss.
+        Next to nothing is at most `_ROUGH` of the loss, and no more than two losses differ that count as one (`EQUAL`).
         """
         local, best = self.local, self.best
         if local is None or not local.failed or local.lost or not torch.equal(local.lowest.point, best.point):

@@ -94,7 +94,10 @@ class Standing(ABC, Generic[P]):
 
     @property
     def polished(self) -> bool:
-        """Whether that minimum is known up to rounding, as far as a model tells; otherwise steps became short there."""
+        """Whether the minimum of `solved` is exact up to rounding, as far as a model tells.
+
+        Otherwise the search has arrived because its steps became short.
+        """
         return self._state.progress.arrivals.polished
 
     @property

@@ -14,7 +14,7 @@ from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs
 
 _STEP = 0.05
-"""Distance of the points from x, in units of sigma; in narrow bounds a quarter of their width."""
+"""Distance of the points from x, in units of sigma, which is at most the width of the bounds."""
 _MOST = 8
 """Parameters up to which they are evaluated."""
 _CENTER = 1e6
@@ -35,8 +35,8 @@ def measure(running: Running) -> None:
         running.evaluate(points)
 
 
-def measured(running: Running, x: Tensor) -> tuple[LocalModel, Tensor] | None:
-    """Return a quadratic around x [n] and its width [n] in units of sigma; None if `measure` has not seen x last.
+def measured(running: Running, x: Tensor) -> tuple[LocalModel, float] | None:
+    """Return a quadratic around x [n] and its width in units of sigma; None if `measure` has not seen x last.
 
     It is also None if an output around x is not finite.
     """
@@ -47,23 +47,19 @@ def measured(running: Running, x: Tensor) -> tuple[LocalModel, Tensor] | None:
     outputs = running.record.outputs(len(told))[1][-count:]
     if len(outputs) < count or not torch.equal(told[-count:], points) or not bool(torch.isfinite(outputs).all()):
         return None
-    step = _step(running.search)
+    step = _STEP * running.search.unit
     weights = torch.tensor([_CENTER] + (count - 1) * [1.0], dtype=step.dtype, device=step.device)
     u = (points - x).to(step) / step
-    model = fit_outputs(u, outputs.reshape(count, -1).to(step), weights, loss, outputs.shape[1:])
-    return model, step / running.search.unit
+    return fit_outputs(u, outputs.reshape(count, -1).to(step), weights, loss, outputs.shape[1:]), _STEP
 
 
 def _surroundings(search: TrustRegion, x: Tensor) -> Tensor | None:
-    """Return x [n] and two points beside it along each parameter, within the bounds: [2 n + 1, n]."""
+    """Return x [n] and two points beside it along each parameter, within the bounds: [2 n + 1, n].
+
+    None for another search than a Gaussian process of outputs, or one of more than 8 parameters.
+    """
     if search.loss is None or search.engine != "gaussian_process" or len(x) > _MOST:
         return None
-    step = torch.diag(_step(search))
+    step = torch.diag(_STEP * search.unit)
     beside = x.to(step) + torch.cat([torch.zeros_like(step[:1]), step, -step])
     return beside.clamp(*search.bounds).to(x)
-
-
-def _step(search: TrustRegion) -> Tensor:
-    """Distance of the points from x along each parameter [n]."""
-    lower, upper = search.bounds
-    return torch.minimum(_STEP * search.unit, ((upper - lower) / 4).to(search.unit))

@@ -23,8 +23,14 @@ def check_callable(**arguments: Any) -> None:
 def check_bool(**arguments: Any) -> None:
     """Raise TypeError for an argument that is neither True nor False, of Python or NumPy."""
     for name, value in arguments.items():
-        if type(value).__name__ not in ("bool", "bool_"):
-            raise TypeError(f"{name} must be True or False, got {value!r}")
+        checked_bool(name, value)
+
+
+def checked_bool(name: str, value: Any) -> bool:
+    """Return True or False. TypeError if it is neither, of Python or NumPy."""
+    if type(value).__name__ not in ("bool", "bool_"):
+        raise TypeError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
 
 
 def check_tensors(**arguments: Any) -> None:

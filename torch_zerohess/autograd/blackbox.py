@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import control_variate, opaque, tracing, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.expanded import general, tangent
@@ -23,7 +22,7 @@ from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.evaluator import Evaluator
-from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
+from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 
@@ -56,8 +55,9 @@ class BlackBox(Layer):
             "drop" is unbiased only where fn fails at random, not where it fails in a region.
 
     Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For x and aux in
-    float16 or bfloat16, as autocast makes them, fn and head get float32. Autocast is off while fn, head and surrogate
-    run: its rounding is larger than the differences that derivatives are made of.
+    float16 or bfloat16, as autocast makes them, fn and head get float32, and losses of a head stay float32, as losses
+    of torch do. Autocast is off while fn, head and surrogate run: its rounding is larger than the differences that
+    derivatives are made of.
 
     A batch without points, [0, n], gives an empty result and zero gradients, without a call of fn. Without a head
     the shape of one output must be known, from an earlier call or the memory, else ValueError.
@@ -66,9 +66,10 @@ class BlackBox(Layer):
     with randomness="different", and does not raise with its default, "error". With seed=None, "same" raises ValueError,
     and so does "different" where neither x nor aux is mapped over.
 
-    `state_dict` has all settings of the smoothing, not sigma alone, and the contents of the memory. `load_state_dict`
-    replaces the settings that the layer was made with, so set others after it: `layer.smoothing =
-    layer.smoothing.replace(samples=16)`. A state without a memory leaves the memory of the layer as it is.
+    `state_dict` has all settings of the smoothing, not sigma alone, and the contents of the memory, as one tensor of
+    bytes. `load_state_dict` replaces the settings that the layer was made with, so set others after it:
+    `layer.smoothing = layer.smoothing.replace(samples=16)`. A state without a memory leaves the memory of the layer as
+    it is. A layer without a memory takes the settings alone with strict=False; otherwise such a state is an error.
 
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
@@ -127,7 +128,7 @@ class BlackBox(Layer):
 
             return eager(self, x, *aux)
         tracing.check_derivatives()
-        dtype, x = checked_input(x, empty=True).dtype, working(x)
+        dtype, x = self._dtype(checked_input(x, empty=True)), working(x)
         check_aux(aux, self.memory, self.call.head)
         batch, n = x.shape[:-1], x.shape[-1]
         center, others = x.detach().reshape(batch.numel(), n), folded_aux(_without_grad(aux), batch)
@@ -175,10 +176,14 @@ class BlackBox(Layer):
         def frozen(z: Tensor) -> Tensor:
             if z.shape != (*batch, n):  # not x, which would keep its graph
                 raise ValueError(f"x must have the shape {[*batch, n]} that was frozen, got {list(z.shape)}")
-            result = around(z.reshape(-1, n))
+            result = around(working(z).reshape(-1, n)).to(self._dtype(z))
             return result.reshape((*batch, *result.shape[1:]))
 
         return frozen
+
+    def _dtype(self, x: Tensor) -> torch.dtype:
+        """Type of the result: that of x, but losses are not rounded to a half one."""
+        return x.dtype if self.call.head is None else working(x).dtype
 
     def _around(self, center: Tensor, aux: list[Tensor], *, zero: bool = True) -> Callable[[Tensor], Tensor]:
         """Evaluate around a center [B, n], and return the estimate as a function of x [B, n].
@@ -235,22 +240,6 @@ class BlackBox(Layer):
             result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, torch.is_grad_enabled(), x, aux)
             return result
         return opaque.center(self, x, aux)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the settings, so that a state_dict resumes an annealed sigma, and what the memory keeps."""
-        settings = settings_of(self.smoothing)
-        return settings if self.memory is None else {**settings, "memory": self.memory.state_dict()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        check_state(state, {}, "a BlackBox")
-        settings = dict(state)
-        memory = settings.pop("memory", None)
-        if memory is not None and self.memory is None:
-            raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
-        smoothing = smoothing_of(settings, "a BlackBox")
-        if memory is not None and self.memory is not None:
-            self.memory.load_state_dict(memory)
-        self.smoothing = smoothing  # after what may fail
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import transforms
 from torch_zerohess.autograd.layer import Layer
 from torch_zerohess.autograd.marker import Input
@@ -18,7 +17,7 @@ from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import check_output, estimated
 from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.precision import without_autocast
-from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
+from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_grid, checked_rate
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
@@ -127,11 +126,3 @@ class SparseBlackBox(Layer):
             self._warned = True
             warnings.warn(doubt, UserWarning, stacklevel=2)
         return found
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the settings of the smoothing, so that a state_dict resumes an annealed sigma."""
-        return settings_of(self.smoothing)
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        check_state(state, {}, "a SparseBlackBox")
-        self.smoothing = smoothing_of(state, "a SparseBlackBox")

@@ -9,7 +9,7 @@ from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.flat import add_parts
-from torch_zerohess.optim.processes import check_alone
+from torch_zerohess.optim.processes import check_alone, warn_alone
 from torch_zerohess.precision import without_autocast
 
 
@@ -36,7 +36,7 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
             network whose outputs do not change with its weights, are random or mix samples, or whose Jacobian is not
             finite.
         RuntimeError: in inference mode, and for a network in `DistributedDataParallel` of several processes, of which
-            each would step alone.
+            each would step alone. Without the wrapper this is a warning.
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.eye(3)[:2]
@@ -52,6 +52,7 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
     weights = [one for one in network.parameters() if one.requires_grad]
     for module in network.modules():
         check_alone(module, weights)
+    warn_alone()
     if not weights:
         raise ValueError("network must have weights that require grad, got none")
     if not len(inputs):

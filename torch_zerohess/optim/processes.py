@@ -1,5 +1,6 @@
 """Steps that all processes of `torch.distributed` take together, and what keeps one from stepping alone."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -45,10 +46,14 @@ def check_equal(parameters: Sequence[Tensor], losses: int) -> None:
 
 @contextmanager
 def refused(parameters: Sequence[Tensor]) -> Iterator[None]:
-    """Within it, raise RuntimeError before a `DistributedDataParallel` of several processes uses a parameter."""
-    if not _started() or distributed.get_world_size() == 1:
+    """Within it, raise RuntimeError before a `DistributedDataParallel` of several processes uses a parameter.
+
+    Warn that each process steps alone: the network may be called without the wrapper, or inside of its call.
+    """
+    if not _several():
         yield
         return
+    warn_alone()
 
     def check(module: nn.Module, _: Any) -> None:
         check_alone(module, parameters)
@@ -58,6 +63,18 @@ def refused(parameters: Sequence[Tensor]) -> Iterator[None]:
         yield
     finally:
         hook.remove()
+
+
+def warn_alone() -> None:
+    """Warn, once by default, if there are several processes, of which each makes a step of its own."""
+    if _several():
+        warnings.warn(
+            f"torch.distributed has {distributed.get_world_size()} processes, and each makes a step of its own. Where "
+            "they share a network, give the optimizer distributed=True if it has this setting, or step in one process "
+            "and broadcast the parameters",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def check_alone(module: nn.Module, parameters: Sequence[Tensor]) -> None:
@@ -74,3 +91,7 @@ def check_alone(module: nn.Module, parameters: Sequence[Tensor]) -> None:
 
 def _started() -> bool:
     return distributed.is_available() and distributed.is_initialized()
+
+
+def _several() -> bool:
+    return _started() and distributed.get_world_size() > 1

@@ -226,7 +226,11 @@ class SecondOrder(Optimizer):
             with nullcontext() if self._distributed else processes.refused(self._parameters):
                 losses, through, jacobian = parts_of(closure())
             if not losses.requires_grad:
-                raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")
+                raise ValueError(
+                    "closure must return a loss with a graph, got one without: no parameter is in it, or it was "
+                    "detached, as by a training loop that calls backward itself; in Lightning set "
+                    "automatic_optimization=False, and give step a closure of your own"
+                )
             parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
             try:
                 of_parts = [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts]

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.arguments import check_state, checked_integer, checked_order
+from torch_zerohess.arguments import check_state, checked_bool, checked_integer, checked_order
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.checked_setting import CheckedSetting
@@ -73,7 +73,9 @@ class Memory:
             outputs of more than 256 numbers, and has slopes, gets 256 / B and at least 32: it takes most of the time.
             An affine surrogate under `heads.SquaredError` needs none in a layer: the expectation is known.
 
-    `capacity`, `fresh`, `order` and `draws` may be set between calls.
+        persistent: whether the `state_dict` of a layer has the evaluations. `Memory.state_dict` always has them.
+
+    All but the surrogate may be set between calls.
 
     Raises:
         TypeError, ValueError: an argument is not as described.
@@ -91,6 +93,7 @@ class Memory:
     fresh = CheckedSetting(lambda value: None if value is None else checked_integer("fresh", value, 0))
     order = CheckedSetting(checked_order)
     draws = CheckedSetting(lambda value: None if value is None else checked_integer("draws", value, 3))
+    persistent = CheckedSetting(lambda value: checked_bool("persistent", value))
 
     def __init__(
         self,
@@ -100,32 +103,34 @@ class Memory:
         fresh: int | None = None,
         order: int = 2,
         draws: int | None = None,
+        persistent: bool = True,
     ) -> None:
         self._points: list[Tensor] = []
         self._outputs: list[Tensor] = []
         self._size = 0
         self.lock = threading.RLock()
         """Held during a call, so that the surrogate does not change in it, and by what reads or changes evaluations."""
-        self.capacity, self.fresh, self.order, self.draws = capacity, fresh, order, draws
+        self.capacity, self.fresh, self.order, self.draws, self.persistent = capacity, fresh, order, draws, persistent
         check_surrogate(surrogate)
         self.surrogate: Any = AutomaticSurrogate(capacity=_ALL) if surrogate is None else surrogate  # all of them
         self.evaluations = 0
         """Evaluations taken so far, those that are no longer kept included."""
         self.pathwise: int | None = None
-        """Orders of pathwise derivatives of the surrogate's term, 0, 1 or 2, see `estimation.surrogate_term`; None: to
-        be measured."""
+        """Orders of pathwise derivatives of the surrogate's term, see `estimation.surrogate_term`; None: not known."""
         self._fitted = 0
         """Evaluations taken at the last fit."""
-        self._rows = 0
-        """How many of the evaluations that are kept the last fit knew: they come first."""
-        self._known = 0
-        """How many evaluations the last fit knew."""
+        self._rows = self._known = 0
+        """How many evaluations the last fit knew: of those that are kept, which come first, and in all."""
         self.regression = Coefficient()
         """What earlier calls show about the surrogate."""
 
     def __len__(self) -> int:
         """Evaluations that are kept."""
         return self._size
+
+    def __bool__(self) -> bool:
+        """True, also of a memory that is empty: `if memory` asks whether there is one."""
+        return True
 
     @property
     @locked

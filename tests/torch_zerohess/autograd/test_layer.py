@@ -148,6 +148,26 @@ def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     assert set(seen) == {torch.float32}
 
 
+@pytest.mark.parametrize("memory", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_losses_of_a_head_stay_float32(dtype: torch.dtype, memory: bool) -> None:
+    """As losses of torch do under autocast: the loss of an image exceeds 65504, and has digits that training needs."""
+    x = leaf(BATCH.to(dtype))
+    layer = BlackBox(
+        lambda z: z.sum(1, keepdim=True) * torch.full((100,), 30.3),
+        AGGREGATE,
+        head=lambda y: y.square().sum(1),
+        memory=Memory() if memory else None,
+    )
+    expected = (x.detach().float().sum(1) * 30.3).square() * 100
+    with torch.no_grad():
+        torch.testing.assert_close(layer(x), expected)
+    for y in (layer(x), layer.freeze(x)(x)):
+        torch.testing.assert_close(y.detach(), expected)
+    assert torch.autograd.grad(layer(x).sum(), x)[0].dtype == dtype
+    assert layer(x[:0]).dtype == torch.float32
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_auxiliary_inputs_in_half_precision_become_float32(dtype: torch.dtype) -> None:
     seen: set[torch.dtype] = set()

@@ -15,6 +15,7 @@ from layers import Fixed
 from torch import Tensor, nn
 
 import torch_zerohess as zh
+from torch_zerohess.autograd.packed_state import unpacked
 
 pytestmark = pytest.mark.usefixtures("short_climbs")
 
@@ -483,8 +484,7 @@ def test_state_dict_carries_the_memory() -> None:
 
 def test_a_state_whose_memory_is_wrong_changes_nothing() -> None:
     first, second = layer(zh.Memory()), layer(zh.Memory())
-    state = first.state_dict()
-    settings = {**next(iter(state.values())), "sigma": 0.2, "memory": {"points": torch.zeros(0, 0)}}
+    settings = {**unpacked(first.get_extra_state()), "sigma": 0.2, "memory": {"points": torch.zeros(0, 0)}}
     with pytest.raises(KeyError):
         second.set_extra_state(settings)
     with pytest.raises(KeyError, match="this one lacks sigma"):

@@ -4,6 +4,7 @@ import copy
 import json
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,13 @@ def message(call) -> str:
     return "none"
 
 
+def warned(call) -> str:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        call()
+    return " ".join(str(one.message) for one in found)
+
+
 def worker(rank: int) -> dict[str, object]:
     x = X[rank : rank + 1]
     found: dict[str, object] = {name: run(name, x, wrapped=True) for name in KINDS}
@@ -82,6 +90,10 @@ def worker(rank: int) -> dict[str, object]:
         return y.square().mean(), y, zh.optim.SampleJacobian(net, x[0])
 
     found["dual alone"] = message(lambda: dual.step(with_jacobian))
+    found["warnings"] = [
+        warned(lambda: zh.optim.NewtonCG(net.module.parameters()).step(lambda: net.module(x).square().mean())),
+        warned(lambda: zh.optim.move_outputs(network(), x[0], torch.ones(8, 2))),
+    ]
     found["move_outputs alone"] = message(lambda: zh.optim.move_outputs(net, x[0], torch.ones(8, 2)))
     other = network(seed=rank)
     found["parameters"] = message(
@@ -136,6 +148,13 @@ def test_a_step_of_each_process_alone_is_refused(name: str, both: list[dict]) ->
         expected = "RuntimeError: the network is a DistributedDataParallel of 2 processes"
         assert one[f"{name} alone"].startswith(expected), one[f"{name} alone"]
         assert one.get(f"{name} unchanged", True)
+
+
+def test_a_step_of_each_process_alone_is_told_where_the_wrapper_is_not_called(both: list[dict]) -> None:
+    """As inside of the call of a wrapper, where Lightning calls a training step."""
+    for one in both:
+        for message in one["warnings"]:
+            assert message.startswith("torch.distributed has 2 processes, and each makes a step of its own"), message
 
 
 @pytest.mark.parametrize("what", ["parameters", "losses"])

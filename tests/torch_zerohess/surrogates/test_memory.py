@@ -34,6 +34,11 @@ def test_it_keeps_what_is_added() -> None:
     assert len(memory) == memory.evaluations == 6
 
 
+def test_a_memory_that_is_empty_is_there() -> None:
+    """`if memory` asks whether there is one."""
+    assert Memory()
+
+
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64])
 @pytest.mark.parametrize("out", [(), (100,)])
 def test_integers_and_truth_values_are_fitted_as_numbers(dtype, out) -> None:

@@ -1,0 +1,36 @@
+"""The state of a layer as one tensor, as files of tensors alone hold it (safetensors, and what is built on it)."""
+
+import ctypes
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_BLOCK = 4096
+"""The length is a multiple of this: the state of a layer without a memory always has one block."""
+_HEADER = 8
+"""Bytes that hold the length of what follows."""
+
+
+def packed(state: Mapping[str, Any], device: torch.device | str = "cpu") -> Tensor:
+    """Return a state as a tensor of bytes [P] on a device."""
+    buffer = io.BytesIO()
+    buffer.write(bytes(_HEADER))
+    torch.save(state, buffer)
+    length = buffer.tell()
+    buffer.write(bytes(-length % _BLOCK))
+    buffer.seek(0)
+    buffer.write((length - _HEADER).to_bytes(_HEADER, "little"))
+    return torch.frombuffer(buffer.getbuffer(), dtype=torch.uint8).to(device)
+
+
+def unpacked(state: Any) -> Any:
+    """Return what was packed, its tensors on the device of the packed one. What is no tensor is returned as it is."""
+    if not isinstance(state, Tensor):
+        return state
+    content = state.detach().cpu().contiguous()
+    length = int.from_bytes(ctypes.string_at(content.data_ptr(), _HEADER), "little")
+    buffer = io.BytesIO(ctypes.string_at(content.data_ptr() + _HEADER, length))
+    return torch.load(buffer, map_location=state.device, weights_only=True)

@@ -58,7 +58,7 @@ def worded(
         message += f"; {doubt}"
     if success and cut:
         message += "; the search had arrived at x, a minimum at least of its surroundings"
-    if cut and found:
+    if cut and found and not equal:
         message += f"; x was found by evaluation {found} of {evaluations}"
     if flat and success and status != "target" and "not unique" not in message:
         message += "; along some direction the loss hardly changes: the minimum may not be unique"

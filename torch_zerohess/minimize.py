@@ -38,6 +38,10 @@ _OTHER_NAMES = {
     "budget": "max_evaluations",
     "tol": "tolerance, xtol or ftol",
     "disp": "verbose",
+    "timeout": "time_limit",
+    "max_time": "time_limit",
+    "n_jobs": "workers",
+    "fixed": "a closure that puts the value in: lambda x: fn(torch.cat([x, torch.full_like(x[:, :1], value)], 1))",
     "args": "a closure: lambda x: fn(x, ...)",
     "jac": "nothing: fn is not differentiated",
     "method": "engine",
@@ -81,7 +85,8 @@ def minimize(
         fn: [K, n] -> [K] or [K, 1], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and
             anything else that cannot be differentiated is fine. Return NaN for a point that cannot be computed, a
             single one also in place of an output, and the search avoids it. An exception ends the search.
-        x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64.
+        x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64. fn, loss and callback get
+            tensors whatever x0 is, and so is `x` of the result: `fit.x.numpy()` makes an array of it.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution. One that is wider
             than the bounds of a parameter are apart counts as their distance.
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where

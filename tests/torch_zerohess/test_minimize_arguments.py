@@ -71,8 +71,13 @@ REFUSED = [
     ({"bounds": (1.0, 2.0)}, ValueError, "x0 must be within the bounds"),
     ({"bounds": ((-1, 1), (0, 9))}, ValueError, TWO_WAYS),
     ({"bounds": ([-1, 1], [0, 9])}, ValueError, TWO_WAYS),
-    ({"bounds": ([0, 1], [0, 5])}, ValueError, r"lower < upper, got 0.0 and 0.0 at index 0"),
-    ({"bounds": ([0, 1], [-1, 5])}, ValueError, r"lower < upper, got 0.0 and -1.0 at index 0"),
+    (
+        {"bounds": ([0, 1], [0, 5])},
+        ValueError,
+        r"lower < upper, got 0.0 and 0.0 at index 0: to hold the "
+        r"parameter at 0.0, leave it out of x0, and call fn\(torch.cat\(\[x\[:, :0\], torch.full_like",
+    ),
+    ({"bounds": ([0, 1], [-1, 5])}, ValueError, r"lower < upper, got 0.0 and -1.0 at index 0$"),
     ({"bounds": np.array([[-1, 1], [0, 9]])}, ValueError, TWO_WAYS),
     ({"bounds": torch.tensor([[-1, 1], [0, 9]])}, ValueError, TWO_WAYS),
     ({"bounds": np.zeros((3, 2))}, ValueError, "a list of 2 pairs, got 3 entries"),

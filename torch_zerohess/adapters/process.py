@@ -40,7 +40,7 @@ class Program(Closing):
       has no bfloat16: such a tensor is written as float32. The answer is one array of numbers, as
       `numpy.save(sys.stdout.buffer, values)` writes it. `numpy.load` cannot read from a pipe. A Python program reads
       one array by `numpy.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))`.
-    - a function of bytes: turns the output of the program into the value. Requests are written as for "json".
+    - a function of bytes: turns the output into the value, and may skip a banner. Requests are written as for "json".
 
     A server writes one answer per request and flushes it, and writes messages to the standard error alone. More answers
     are an error of the call if they come with the first one, and of the next call if they are there when it begins. A
@@ -288,7 +288,8 @@ class Program(Closing):
             start = output[:200].decode(errors="replace")
             named = "what the function `format` reads" if callable(self.format) else f"values as {self.format}"
             read = self.format == "json" and not isinstance(error, json.JSONDecodeError)
-            advice = "" if read else ": let it print messages to its standard error"
+            skip = "" if self.server or callable(self.format) else ", or skip them in a function `format`"
+            advice = "" if read else f": let it print messages to its standard error{skip}"
             raise ValueError(
                 f"the program must write {named} and nothing else to its standard output, got {start!r} "
                 f"({type(error).__name__}: {error}){advice}{shown(errors)}"

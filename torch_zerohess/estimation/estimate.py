@@ -1,6 +1,7 @@
 """Value, gradient, Hessian and Hessian-vector products of a smoothed function from one batch of evaluations."""
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -62,7 +63,9 @@ def estimate(
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else. Without aux if there is a head.
         x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came. An x
-            that requires grad is taken as x.detach(): autograd sees a constant. Transforms of `torch.func` are refused.
+            that requires grad is taken as x.detach(): autograd sees a constant. A `UserWarning` says so if x is made
+            from others while torch records a graph, as in `torch.autograd.functional.hessian`. Transforms of
+            `torch.func` are refused.
         smoothing: how to sample.
         *aux: further inputs of fn, [*batch, ...] each, repeated for every evaluation of their batch element; with a
             head its inputs, which are not copied. float16 and bfloat16 become float32.
@@ -102,6 +105,13 @@ def estimate(
     _check_memory(call, aux, memory, tolerance)
     tensors = {f"aux[{k}]": one for k, one in enumerate(aux) if isinstance(one, Tensor)}
     check_no_derivative(NO_GRAPH, x=checked_input(x), **tensors)
+    if x.requires_grad and not x.is_leaf and torch.is_grad_enabled():
+        warnings.warn(
+            "x has a graph, but the estimate has none, so derivatives by x would be 0: use smooth(fn, smoothing), or "
+            "give x.detach()",
+            UserWarning,
+            stacklevel=2,
+        )
     x = checked_input(x).detach().clone()
     if joint and (x.ndim != 2 or head is not None or memory is not None):
         raise ValueError(

@@ -89,7 +89,7 @@ def finite_difference_hvp(
     other = seed if common else seed ^ (1 << 61)
     how: dict[str, Any] = {"vectorized": vectorized, "evaluator": evaluator, "on_nonfinite": on_nonfinite}
     forward, backward = (
-        estimate(fn, x + sign * offset, smoothing.replace(seed=s), *aux, value="smoothed", **how)
+        estimate(fn, (x + sign * offset).detach(), smoothing.replace(seed=s), *aux, value="smoothed", **how)
         for sign, s in ((1.0, seed), (-1.0, other))
     )
     difference = forward._unrounded_gradient() - backward._unrounded_gradient()  # of numbers that may be nearly equal

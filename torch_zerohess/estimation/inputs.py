@@ -140,6 +140,7 @@ def check_aux(aux: Sequence[Tensor], memory: object, head: object) -> None:
     """Raise ValueError for inputs of fn beside a memory: an output that depends on them serves no other call."""
     if aux and memory is not None and head is None:
         raise ValueError(
-            f"aux must be empty with a memory and no head, got {len(aux)} tensors: fn gets points alone, and what "
-            "depends on aux belongs in head"
+            f"aux must be empty with a memory and no head, got {len(aux)} tensors: fn gets points alone. Give a head "
+            "that takes aux, where only the loss depends on it. If fn needs it, make it parameters: x is then "
+            "torch.cat([x, aux], -1), where aux is a few numbers. Or leave the memory out"
         )

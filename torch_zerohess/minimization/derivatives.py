@@ -5,7 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.minimization.regression import FITTED
+from torch_zerohess.search.protocol.state import are_same
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.noisy_derivatives import noisy_derivatives
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -63,6 +65,21 @@ def is_flat(found: Derivatives, unit: Tensor) -> bool:
     curvatures, directions = torch.linalg.eigh(bent)
     largest = float(curvatures[-1])
     return bool(((curvatures.abs() < _FLAT * largest) & ((slope @ directions).abs() <= _LEVEL * largest)).any())
+
+
+def is_elsewhere(found: Derivatives, x: Tensor, search: TrustRegion) -> bool:
+    """Whether the quadratic around x [n] has its minimum within the bounds elsewhere, or is not known.
+
+    Elsewhere is farther away than the tolerance with which the search arrives.
+    """
+    if found.gradient is None or found.hessian is None:
+        return True
+    unit, root = search.unit, torch.eye(len(x), dtype=search.unit.dtype, device=search.unit.device)
+    slope, bend = found.gradient.to(unit) * unit, found.hessian.to(unit) * unit[:, None] * unit
+    if not bool(torch.isfinite(slope).all() and torch.isfinite(bend).all()):
+        return True
+    lower, upper = ((one - x).to(unit) / unit for one in search.bounds)
+    return not are_same(region_step(slope, bend, root, lower, upper), torch.zeros_like(unit), search.tolerance)
 
 
 def _model(

@@ -1,5 +1,6 @@
 """The iterates of a minimisation, and its result."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -42,6 +43,8 @@ class Iterate:
 class Minimum:
     """The best point found, and the smoothed function around it.
 
+    `torch.save(dataclasses.asdict(fit), file)` keeps it in a file that `torch.load` reads: tensors, numbers and text.
+
     Attributes:
         x: [n], the point with the lowest loss; in noise, with the lowest expected loss. It has the type and device of
             x0. Some parameters may stay at x0; the message says which. Then x is the best point with these values.
@@ -62,6 +65,8 @@ class Minimum:
             2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.
         sigma: [n], width of the quadratic along every parameter; in noise, the mean distance from x of the evaluations
             that the derivatives were fitted to.
+        at_bounds: [n], bools: which parameters of x lie at one of their bounds. The Laplace approximation does not hold
+            along them: `covariance(fixed=fit.at_bounds.nonzero())`.
         evaluations: how many there were, without those that were `known` before.
         points: [evaluations, n], where, in order.
         values: [evaluations], float64, the losses there; NaN where an output is not finite.
@@ -69,11 +74,13 @@ class Minimum:
         noise: standard deviation of repeated losses at one point, as it was given or measured at x0; 0 without noise.
         success: whether the target was reached, or the search has found x to be a minimum, possibly a local one, which
             may lie above the target: `status` says which. After it has found a minimum it may have looked for a lower
-            one until its evaluations were used up: then the status is "budget".
+            one until its evaluations were used up: then the status is "budget", and the message says which evaluation
+            has found x.
         status: target: the value is at most the target. solved: the search has ended at a minimum, possibly a local
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and, unless
             several rounds agree, where fn jumps, fails, is constant or has a cusp at x, or a kink whose slopes do not
-            decide; or the loss falls without end. budget, time: evaluations or seconds are used up. callback,
+            decide, or where steps became short although a quadratic around x has its minimum elsewhere; or the loss
+            falls without end. budget, time: evaluations or seconds are used up. callback,
             interrupted: the caller has ended it. failed: the black box, the loss, the callback or the search has
             raised.
         message: why the search ended, in words.
@@ -86,6 +93,7 @@ class Minimum:
     hessian: Tensor | None
     standard_errors: dict[str, Tensor] | None
     sigma: Tensor
+    at_bounds: Tensor
     evaluations: int
     points: Tensor
     values: Tensor
@@ -106,8 +114,9 @@ class Minimum:
 
         Args:
             fixed: numbers of parameters that are held at their values in x, such as one that the data do not determine,
-                or one that takes whole numbers only. The covariance of the others is the inverse of the Hessian
-                without the rows and columns of fixed parameters. Rows and columns of fixed parameters are 0.
+                or one that takes whole numbers only, or those of `at_bounds`. The covariance of the others is the
+                inverse of the Hessian without the rows and columns of fixed parameters. Rows and columns of fixed
+                parameters are 0.
 
         The loss must be the negative logarithm of the likelihood, or of the posterior density. For residuals r with
         independent Gaussian errors of standard deviation s it is sum(r^2 / s^2) / 2. The standard deviations of the
@@ -150,7 +159,7 @@ class Minimum:
         axes.step(counts, known.cummin(0).values, where="post", label="lowest so far")
         if self.value_error:
             axes.errorbar([len(values)], [self.value], [self.value_error], fmt="o", capsize=3, label="value at x")
-        axes.set(xlabel="evaluations", ylabel="loss", title=self.message)
+        axes.set(xlabel="evaluations", ylabel="loss", title=textwrap.fill(self.message, 60))
         if bool((known > 0).all()):
             axes.set_yscale("log")
         axes.legend()

@@ -38,6 +38,14 @@ class NewtonCG(NewtonStep):
     samples are needed, not more steps. This costs no evaluations of the black box, but R backward passes instead of
     one. `exit` says why conjugate gradients ended last.
 
+    Weight decay. For w / 2 |params|^2 add it to the loss of the closure. With curvature "gauss_newton" its curvature is
+    not in J^T H J: add w to `damping`, too. Solver "dual" refuses such a loss.
+
+    Random layers. With `adapt` the closure is called again at the end of every step, and dropout draws another mask
+    there: give `adapt=False`. A step then takes value, gradient and curvature from one call, hence from one mask. Batch
+    normalisation in training mode is no noise if every call has the same batch: its derivatives contain the mean and
+    the variance of the batch. Its running statistics move with every call.
+
     Args:
         params: parameters, one group.
         radius: of the trust region, in units of the parameters; the initial one with `adapt`.

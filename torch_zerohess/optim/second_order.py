@@ -186,12 +186,15 @@ class SecondOrder(Optimizer):
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse a second group of parameters, because the quadratic model has one Hessian, and settings in a group."""
         if self.param_groups:
-            raise ValueError("params must be one group: the quadratic model has one Hessian")
-        if own := param_group.keys() - {"params", "param_names"}:
             raise ValueError(
-                f"params must have no settings of their own, got {', '.join(sorted(own))}: give them to "
-                f"{type(self).__name__}"
+                "params must be one group, as for torch.optim.LBFGS, because the quadratic model has one Hessian: give "
+                "all parameters in one list"
             )
+        if own := param_group.keys() - {"params", "param_names"}:
+            advice = f"give them to {type(self).__name__}"
+            if "weight_decay" in own:
+                advice = "for a weight decay w add w / 2 * sum(p.square().sum() for p in params) to the loss"
+            raise ValueError(f"params must have no settings of their own, got {', '.join(sorted(own))}: {advice}")
         super().add_param_group(param_group)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """External programs: what they answer, what they do wrong, and a real one."""
 
+import json
 import os
 import pickle
+import shlex
 import shutil
 import signal
 import subprocess
@@ -570,3 +572,15 @@ def test_a_process_made_by_a_fork_has_a_server_of_its_own():
 def test_wrong_arguments_are_named(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_a_banner_before_the_numbers_can_be_skipped():
+    code = "print('Version 2'); print('ready', flush=True)\nfor line in sys.stdin: "
+    code = READ + code + "print([sum(p) for p in json.loads(line)['x']], flush=True)"
+    x = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    with pytest.raises(ValueError, match="to its standard error, or skip them in a function `format`"):
+        python(code)(x)
+    assert python(code, format=lambda output: json.loads(output.splitlines()[-1]))(x).tolist() == [3.0, 7.0]
+    command = ["sh", "-c", f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} | sed -u 1,2d"]
+    with Program(command, server=True, timeout=60.0) as server:
+        assert [server(x).tolist(), server(x[:1]).tolist()] == [[3.0, 7.0], [3.0]]

@@ -557,3 +557,17 @@ def test_what_nobody_differentiates_may_be_estimated_inside_of_a_transform(name:
 def test_a_head_that_returns_an_array_is_told_so() -> None:
     with pytest.raises(TypeError, match=r"head must return a real floating-point tensor, got <class 'numpy.ndarray'>"):
         estimate(lambda z: z, vector(1.0, 2.0), Smoothing(sigma=0.1), head=lambda outputs: outputs.sum(1).numpy())
+
+
+def test_an_estimate_at_a_point_with_a_graph_warns_that_it_has_none():
+    """torch.autograd.functional.hessian of it is zero: torch takes it for a constant."""
+
+    def value(x: torch.Tensor) -> torch.Tensor:
+        return zh.estimate(lambda z: z.square().sum(1), x, zh.Smoothing(sigma=0.1, samples=2)).value
+
+    x = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    with pytest.warns(UserWarning, match="x has a graph, but the estimate has none.*use smooth"):
+        assert not bool(torch.autograd.functional.hessian(value, x.detach()).any())
+    value(x)  # a parameter: no warning, and none where torch records nothing
+    with torch.no_grad():
+        value(2 * x)

@@ -34,3 +34,18 @@ def test_after_failures_a_search_that_stalled_says_what_fn_may_return_instead():
     advice = "; let fn return a loss that grows with the violation, or outputs, with a penalty in loss="
     assert said("stalled", 3) == said("budget", 3) + advice
     assert "violation" not in said("budget", 3) + said("stalled", 0)
+
+
+def test_a_message_says_what_holds_at_the_end_where_that_helps():
+    which = torch.arange(8) > 1
+
+    def said(status, **more):
+        return worded("ended", status, 0, "", None, arrived=False, success=False, **more)
+
+    assert said("solved", at_bounds=which) == "ended; 6 of 8 parameters (2, 3, 4, 5, 6, ...) lie at a bound"
+    assert said("target", at_bounds=which, narrow=which) == said("failed", at_bounds=which, narrow=which) == "ended"
+    found = {"found": 3, "evaluations": 9}
+    assert said("budget", **found) == said("time", **found) == "ended; x was found by evaluation 3 of 9"
+    assert said("solved", **found) == said("budget") == "ended"
+    plateau = worded("ended", "budget", 9, "", None, arrived=False, success=False, **found)
+    assert plateau == "ended; all 9 values are equal: enlarge sigma"

@@ -277,6 +277,8 @@ def test_errors():
         zh.optim.NewtonCG([{"params": [x]}, {"params": [torch.ones(1, requires_grad=True)]}])
     with pytest.raises(ValueError, match="one group"):
         zh.optim.NewtonCG([x]).add_param_group({"params": [torch.ones(1, requires_grad=True)]})
+    with pytest.raises(ValueError, match=r"no settings of their own, got weight_decay: for a weight decay w add w / 2"):
+        zh.optim.NewtonCG([{"params": [x], "weight_decay": 0.1}])
     with pytest.raises(ValueError, match="not finite"):
         zh.optim.NewtonCG([x]).step(lambda: (x * float("nan")).sum())
     assert torch.equal(x.detach(), torch.ones(2))
@@ -314,3 +316,21 @@ def test_a_network_with_attention_in_plain_operations() -> None:
     with sdpa_kernel(SDPBackend.MATH):
         losses = [float(optimizer.step(lambda: layer(network(x)).mean())) for _ in range(8)]
     assert losses[-1] < 0.1 * losses[0]
+
+
+@pytest.mark.parametrize(("curvature", "damping"), [("exact", 0.0), ("gauss_newton", 0.3)])
+def test_weight_decay_in_the_closure_ends_at_the_ridge_solution(curvature, damping):
+    """One step to theta = (A^T A + w I)^-1 A^T b. With "gauss_newton" the damping stands for the curvature of w."""
+    draws, w = torch.Generator().manual_seed(0), 0.3
+    A, b = (torch.randn(*shape, generator=draws, dtype=torch.float64) for shape in ((6, 3), (6,)))
+    theta = torch.ones(3, dtype=torch.float64, requires_grad=True)
+    optimizer = zh.optim.NewtonCG([theta], radius=1e3, curvature=curvature, damping=damping, tolerance=1e-12)
+
+    def closure():
+        y = A @ theta
+        loss = 0.5 * (y - b).square().sum() + 0.5 * w * theta.square().sum()
+        return (loss, y) if curvature == "gauss_newton" else loss
+
+    optimizer.step(closure)
+    expected = torch.linalg.solve(A.mT @ A + w * torch.eye(3, dtype=A.dtype), A.mT @ b)
+    assert float((theta.detach() - expected).norm()) < 1e-9

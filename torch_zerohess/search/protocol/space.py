@@ -162,7 +162,10 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
     lower, upper = lower.expand_as(x0), upper.expand_as(x0)
     if not bool((lower < upper).all()):
         k = int((~(lower < upper)).nonzero()[0])
-        raise ValueError(f"bounds must have lower < upper, got {float(lower[k])} and {float(upper[k])} at index {k}")
+        low, high = float(lower[k]), float(upper[k])
+        hold = f"torch.cat([x[:, :{k}], torch.full_like(x[:, :1], {low}), x[:, {k}:]], 1)"
+        held = f": to hold the parameter at {low}, leave it out of x0, and call fn({hold})" if low == high else ""
+        raise ValueError(f"bounds must have lower < upper, got {low} and {high} at index {k}{held}")
     start, inner = x0.detach(), (lower.to(x0.dtype), upper.to(x0.dtype))
     within = (start >= inner[0]) & (start <= inner[1])  # 0.3 is no number of float32, and may be start and bound
     if not bool(within.all()):

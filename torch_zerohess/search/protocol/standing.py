@@ -93,6 +93,11 @@ class Standing(ABC, Generic[P]):
         return self._state.progress.is_at_arrival(self._method.settings.tolerance)
 
     @property
+    def tolerance(self) -> float:
+        """Length, in units of the first sigma sqrt(n), below which it arrives."""
+        return self._method.settings.tolerance
+
+    @property
     def polished(self) -> bool:
         """Whether the minimum of `solved` is exact up to rounding, as far as a model tells.
 

@@ -266,7 +266,10 @@ def restored_progress(kind: type[P], state: Mapping[str, Any], device: torch.dev
     try:
         return restored(kind, state["progress"], device)
     except ValueError as error:
-        raise ValueError(f"state must be one that this version can read: {error} ({written_by(state)})") from error
+        raise ValueError(
+            f"state must be one that this version can read: {error} ({written_by(state)}): begin a new search with its "
+            "evaluations, by tell_at, or known= of minimize"
+        ) from error
 
 
 def _restored(hint: Any, value: Any, device: torch.device) -> Any:

@@ -132,7 +132,7 @@ def gradient_lobe_quantile(p: Tensor) -> Tensor:
 
 
 def hessian_lobe_quantile(p: Tensor) -> Tensor:
-    """Inverse CDF of the density sqrt(e)/4 |u^2 - 1| exp(-u^2/2), p in (0, 1).
+    """Inverse CDF of the density sqrt(e)/4 |u^2 - 1| exp(-u^2/2), p in [1e-150, 1).
 
     The CDF is P = |u|/4 exp((1-u^2)/2) for u < -1, 1/2 + u/4 exp((1-u^2)/2) inside, 1 - u/4 exp((1-u^2)/2) for u > 1
     (supplement, Eq. 52, whose second and third branch carry the wrong sign and offset in print). Hence

@@ -17,6 +17,8 @@ def test_larger_batches_take_fewer_rounds_and_workers_change_nothing(capsys):
     assert alone.reached == four.reached == spread.reached == 1.0
     assert (alone.rounds_ratio, alone.seconds_ratio) == (1.0, 1.0)
     assert four.rounds < 0.6 * alone.rounds
+    assert alone.rounds == alone.evaluations  # one worker evaluates one point in a round
+    assert four.rounds >= four.evaluations / 4
     assert four.evaluations > alone.evaluations
     assert (spread.rounds, spread.evaluations, spread.rounds_ratio) == (
         four.rounds,

@@ -4,10 +4,10 @@ The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory
 of a batch. With up to 10 parameters the loss is the local entropy, which leaves plateaus where the mean does not. With
 more parameters a few draws never hit a valley, and the loss is the mean. This is what a user would write: everything
 comes from the public names of the library. All tasks have the same settings, the defaults below, but for CNN-THROW (see
-`settings/ours.py`). They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
-runs 100 to 107 of CNN-THROW. The weights in the coefficient of `zh.Memory` were chosen on runs 14, 16 and 17 of CNN
-with 1 200 renders, `output_radius` on runs 17, 33 and 36, and `warm_up` on run 8 of CNN-TEXTURE. No table reports one
-of these runs.
+`settings/ours.py`). They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on runs 100
+to 107 of CNN-THROW; `least_steps` on runs 100 to 107 of CNN with 100 renders. The weights in the coefficient of
+`zh.Memory` were chosen on runs 14, 16 and 17 of CNN with 1 200 renders, `output_radius` on runs 17, 33 and 36, and
+`warm_up` on run 8 of CNN-TEXTURE. No table reports one of these runs.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the
@@ -59,13 +59,14 @@ def through_memory(
     many_lr: tuple[float, float] = (1e-2, 3e-4),
     warm_up: float = 0.05,
     temperature: float = 0.15,
-    least_steps: int = 0,
+    least_steps: int = 400,
 ) -> zh.Memory:
     """Train until the evaluations are used, and return what has been rendered.
 
     The first renders are around the predictions of the first images, at distances of sigma. A tenth of the evaluations
     is used for them, 20 to 64; of many parameters n + 76, so that an affine map is known. If none are left, training
-    goes on with the surrogate alone.
+    goes on with the surrogate alone. Steps on the surrogate alone also come between the others where these are few: a
+    render of one parameter tells more than a step can use.
 
     Args:
         trial: the run.
@@ -83,7 +84,8 @@ def through_memory(
         warm_up: share of the training in which the learning rate grows to its first value. Without it, some networks
             do not train.
         temperature: of the local entropy over the mean loss, with up to 10 parameters.
-        least_steps: where fewer steps use all evaluations, steps on the surrogate alone come between them.
+        least_steps: where fewer steps use all evaluations, steps on the surrogate alone come between them, up to this
+            number in all.
     """
     task, network = trial.task, trial.encoder
     error = zh.heads.SquaredError()

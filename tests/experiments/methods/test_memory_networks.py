@@ -20,7 +20,7 @@ def test_uses_its_evaluations_and_reduces_the_error(method, evaluations, most, l
     if most is not None:
         monkeypatch.setattr("experiments.methods.memory_networks.MOST", most)
         monkeypatch.setattr("experiments.methods.memory_networks._STEPS_ALONE", 40)
-    outcome, trial = trained(method, Bump(replace(SIZE, evaluations=evaluations)))
+    outcome, trial = trained(method, Bump(replace(SIZE, evaluations=evaluations)), least_steps=0)
     assert outcome.evaluations == evaluations
     assert trial.rows[-1].parameter_error < left * trial.rows[0].parameter_error
 

@@ -12,17 +12,22 @@ from experiments.problems import catalogue
 from experiments.problems.network_task import Encoder
 from experiments.runs.network_trial import NetworkTrial
 
+FEW = {"least_steps": 0}
 
-@pytest.mark.parametrize(("method", "left"), [("memory_pairs", 0.1), ("random_pairs", 0.1), ("prior_pairs", 0.02)])
-def test_uses_its_evaluations_and_reduces_the_error(method, left):
-    outcome, trial = trained(method, Bump(replace(SIZE, evaluations=60)), fits=300)
+
+@pytest.mark.parametrize(
+    ("method", "left", "settings"),
+    [("memory_pairs", 0.1, {"newton": FEW}), ("random_pairs", 0.1, {}), ("prior_pairs", 0.02, {})],
+)
+def test_uses_its_evaluations_and_reduces_the_error(method, left, settings):
+    outcome, trial = trained(method, Bump(replace(SIZE, evaluations=60)), fits=300, **settings)
     assert outcome.evaluations == 60
     assert trial.rows[-1].parameter_error < left * trial.rows[0].parameter_error
 
 
 def test_the_pairs_come_after_newton():
-    _, newton = trained("memory_newton", Bump(replace(SIZE, evaluations=60)))
-    _, pairs = trained("memory_pairs", Bump(replace(SIZE, evaluations=60)), fits=300)
+    _, newton = trained("memory_newton", Bump(replace(SIZE, evaluations=60)), **FEW)
+    _, pairs = trained("memory_pairs", Bump(replace(SIZE, evaluations=60)), newton=FEW, fits=300)
     count = len(newton.rows)
     assert [row.parameter_error for row in pairs.rows[:count]] == [row.parameter_error for row in newton.rows]
     assert pairs.rows[-1].parameter_error < 0.2 * newton.rows[-1].parameter_error

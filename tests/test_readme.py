@@ -123,7 +123,7 @@ def test_setup_commands_are_one_line_each():
         assert setup.startswith(SETUP)
         assert "\n" not in setup
     main, tests = setups
-    assert main.endswith("python -m experiments run cnn --methods our_g,memory_newton --evaluations 400")
+    assert main.endswith("python -m experiments run cnn --methods our_g,memory_newton --evaluations 100")
     assert tests.endswith("python -m pytest -q -n 2 --dist loadfile")
 
 

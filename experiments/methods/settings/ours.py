@@ -24,10 +24,10 @@ LOCAL: dict[str, dict[str, Any]] = {
 }
 """Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
-_STEPS = 400
+_STEPS = 1200
 NETWORKS: dict[str, dict[str, Any]] = {
-    # By hand: the radius on runs 100 to 102 with 1 000 simulations, beside the default; the steps and the learning rate
-    # on runs 1000 to 1003 with 60 to 300 simulations.
+    # By hand: the radius on runs 100 to 102 with 1 000 simulations, beside the default; the learning rate on runs 1000
+    # to 1003 with 60 to 300 simulations; the steps on runs 100 to 107 of memory_adam with 150 simulations, beside 400.
     "cnn_throw": {
         "memory_newton": {"radius": (0.3, 0.01), "least_steps": _STEPS},
         "memory_targets": {"least_steps": _STEPS},

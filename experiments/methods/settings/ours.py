@@ -24,16 +24,14 @@ LOCAL: dict[str, dict[str, Any]] = {
 }
 """Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
-_STEPS = 1200
 NETWORKS: dict[str, dict[str, Any]] = {
     # By hand: the radius on runs 100 to 102 with 1 000 simulations, beside the default; the learning rate on runs 1000
-    # to 1003 with 60 to 300 simulations; the steps on runs 100 to 107 of memory_adam with 150 simulations, beside 400.
+    # to 1003 with 60 to 300 simulations; 400 or 1 200 steps with 150 simulations, on runs 100 to 107 of memory_adam and
+    # on runs 100 to 102 of memory_newton and memory_targets.
     "cnn_throw": {
-        "memory_newton": {"radius": (0.3, 0.01), "least_steps": _STEPS},
-        "memory_targets": {"least_steps": _STEPS},
-        "memory_adam": {"lr": (1e-3, 1e-4), "least_steps": _STEPS},
-        "memory_pairs": {"newton": {"radius": (0.3, 0.01), "least_steps": _STEPS}},
+        "memory_newton": {"radius": (0.3, 0.01)},
+        "memory_adam": {"lr": (1e-3, 1e-4), "least_steps": 1200},
+        "memory_pairs": {"newton": {"radius": (0.3, 0.01)}},
     },
 }
-"""Radii on the weights, where the default ends before the outputs have moved, and steps on the surrogate alone, where a
-simulation tells more than a step can use."""
+"""Radii on the weights, where the default ends before the outputs have moved, and more steps on the surrogate alone."""

@@ -141,10 +141,11 @@ def _model(layer: zh.BlackBox, encoder: nn.Module, images: Tensor, *, difference
     The white box ends at the predictions y [B, n]; Newton-CG goes through them with J^T (d2/dy2) J.
     """
     y, fn, smoothing = encoder(images), layer.fn, layer.smoothing
-    local = zh.estimate(fn, y, smoothing, images)
-    hessian = hessian_by_differences(fn, y, smoothing, images) if differences else local.hessian()
+    x = y.detach()
+    local = zh.estimate(fn, x, smoothing, images)
+    hessian = hessian_by_differences(fn, x, smoothing, images) if differences else local.hessian()
     values, vectors = torch.linalg.eigh(hessian)
-    d = y - y.detach()
+    d = y - x
     along = (vectors.mT @ d[..., None])[..., 0]
     model = local.value + (local.gradient * d).sum(1) + 0.5 * (values.abs() * along**2).sum(1)
     return model.mean(), y

@@ -65,8 +65,8 @@ def through_memory(
 
     The first renders are around the predictions of the first images, at distances of sigma. A tenth of the evaluations
     is used for them, 20 to 64; of many parameters n + 76, so that an affine map is known. If none are left, training
-    goes on with the surrogate alone. Steps on the surrogate alone also come between the others where these are few: a
-    render of one parameter tells more than a step can use.
+    goes on with the surrogate alone. Where new renders would last for few steps, steps on the surrogate alone come
+    between them: a render tells more than one step can use.
 
     Args:
         trial: the run.

@@ -64,7 +64,8 @@ class Layer(nn.Module):
     ) -> None:
         """Load as torch does. A memory that the layer has not is unexpected, hence left out with strict=False."""
         key = f"{prefix}_extra_state"
-        if self.memory is None and key in state_dict and "memory" in (state := unpacked(state_dict[key])):
+        state = unpacked(state_dict[key]) if self.memory is None and key in state_dict else None
+        if isinstance(state, Mapping) and "memory" in state:
             state_dict = {**state_dict, key: {name: state[name] for name in state if name != "memory"}}
             unexpected.append(f"{key} with a memory: make the layer with memory=Memory()")
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, unexpected, errors)

@@ -27,10 +27,20 @@ def packed(state: Mapping[str, Any], device: torch.device | str = "cpu") -> Tens
 
 
 def unpacked(state: Any) -> Any:
-    """Return what was packed, its tensors on the device of the packed one. What is no tensor is returned as it is."""
+    """Return what was packed, its tensors on the device of the packed one. What is no tensor is returned as it is.
+
+    Raises ValueError for a tensor that `packed` has not made, such as one of another type, or cut.
+    """
     if not isinstance(state, Tensor):
         return state
     content = state.detach().cpu().contiguous()
-    length = int.from_bytes(ctypes.string_at(content.data_ptr(), _HEADER), "little")
-    buffer = io.BytesIO(ctypes.string_at(content.data_ptr() + _HEADER, length))
+    whole = content.dtype == torch.uint8 and content.ndim == 1 and len(content) >= _HEADER
+    data = ctypes.string_at(content.data_ptr(), len(content)) if whole else b""
+    length = int.from_bytes(data[:_HEADER], "little")
+    if not 0 < length <= len(data) - _HEADER:
+        raise ValueError(
+            "the state of a layer must be the tensor of bytes that its state_dict has, uint8 and not cut, got "
+            f"{content.dtype} of shape {list(content.shape)}"
+        )
+    buffer = io.BytesIO(memoryview(data)[_HEADER : _HEADER + length])
     return torch.load(buffer, map_location=state.device, weights_only=True)

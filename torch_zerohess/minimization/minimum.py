@@ -80,9 +80,8 @@ class Minimum:
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and, unless
             several rounds agree, where fn jumps, fails, is constant or has a cusp at x, or a kink whose slopes do not
             decide, or where steps became short although a quadratic around x has its minimum elsewhere; or the loss
-            falls without end. budget, time: evaluations or seconds are used up. callback,
-            interrupted: the caller has ended it. failed: the black box, the loss, the callback or the search has
-            raised.
+            falls without end. budget, time: evaluations or seconds are used up. callback, interrupted: the caller has
+            ended it. failed: the black box, the loss, the callback or the search has raised.
         message: why the search ended, in words.
         engine: which search it was: "gaussian_process", "descent" or "local".
     """

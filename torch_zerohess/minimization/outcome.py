@@ -29,11 +29,12 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
     success = status in ("target", "solved") or arrived
     at = (points[own] == x).all(1).nonzero()
     lower, upper = search.bounds
+    at_bounds = (x == lower) | (x == upper)
     return Minimum(
         x=x,
         value=value,
         **around._asdict(),
-        at_bounds=(x == lower) | (x == upper),
+        at_bounds=at_bounds,
         evaluations=running.evaluations,
         points=points[own],
         values=losses[own],
@@ -51,7 +52,7 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
             same_outputs=running.record.same_outputs,
             found=int(at[0]) + 1 if len(at) and not running.noise else 0,
             evaluations=running.evaluations,
-            at_bounds=(x == lower) | (x == upper),
+            at_bounds=at_bounds,
             narrow=_narrow(running, points, x),
         ),
         engine=search.engine,

@@ -37,11 +37,12 @@ class NonlinearCG(SecondOrder):
     - The source never raises its restart counter; here it counts.
     - The radius is in units of the parameters. For a radius in units of sigma set `param_groups[0]["radius"]` whenever
       sigma changes.
-    - Through a layer with a fixed `seed`, moves see one draw of the noise. Where its Hessian is far from the true one,
-      moves circle around the minimum for ever: use `seed=None`.
 
     If the loss or its gradient is not finite after a move, three quarters of the move are taken back, up to nine times,
     also at the start of the next step.
+
+    Give the layer `seed=None`. With a fixed seed all moves see one draw of the noise. If the Hessian of this draw is
+    far from the true one, moves may circle around the minimum for ever.
 
     Args:
         params: parameters, one group.

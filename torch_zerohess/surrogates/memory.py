@@ -72,7 +72,6 @@ class Memory:
             parameters 4, or 64 with kinks or jumps; for fewer 1024 / B and at least 64. A head of yours that takes
             outputs of more than 256 numbers, and has slopes, gets 256 / B and at least 32: it takes most of the time.
             An affine surrogate under `heads.SquaredError` needs none in a layer: the expectation is known.
-
         persistent: whether the `state_dict` of a layer has the evaluations. `Memory.state_dict` always has them.
 
     All but the surrogate may be set between calls.

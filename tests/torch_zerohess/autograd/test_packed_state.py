@@ -68,6 +68,24 @@ def test_the_tensors_are_where_the_bytes_are() -> None:
     assert packed({"numbers": torch.arange(3)}, "meta").device.type == "meta"
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        packed({"numbers": torch.arange(1000)})[:5000],  # its length is that of the whole
+        packed({}).half(),  # as by a conversion of all tensors of a file
+        packed({})[None],
+        torch.zeros(4, dtype=torch.uint8),
+        torch.zeros(4096, dtype=torch.uint8),
+    ],
+)
+def test_a_tensor_that_is_no_state_is_refused(wrong: torch.Tensor) -> None:
+    """Nothing beyond its end is read."""
+    with pytest.raises(
+        ValueError, match=r"must be the tensor of bytes that its state_dict has, uint8 and not cut, got"
+    ):
+        layer().load_state_dict({"_extra_state": wrong})
+
+
 def test_a_state_that_is_a_dictionary_is_taken_too() -> None:
     one = layer()
     one.load_state_dict(OrderedDict(_extra_state=settings_of(zh.Smoothing(sigma=0.7))))

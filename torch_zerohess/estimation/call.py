@@ -13,6 +13,7 @@ from torch_zerohess.estimation.advice import add_advice
 from torch_zerohess.estimation.head import Head, apply_head
 from torch_zerohess.estimation.inputs import all_finite, times_changed
 from torch_zerohess.estimation.outer import Outer, outer_of
+from torch_zerohess.estimation.rounding import RoundingCheck
 from torch_zerohess.evaluators.batch import loss_error
 from torch_zerohess.evaluators.evaluator import Evaluator
 from torch_zerohess.evaluators.factory import Each
@@ -48,6 +49,7 @@ class BlackBoxCall:
     """Whether a call has given values."""
     latest: Tensor | None = field(default=None, init=False, repr=False, compare=False)
     """The latest outputs, without points: [0, *out]. None as long as no call has given outputs of several numbers."""
+    rounding: RoundingCheck = field(default_factory=RoundingCheck, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not callable(self.fn):

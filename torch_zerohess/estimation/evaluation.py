@@ -120,6 +120,7 @@ def evaluate(
     references, encoded, scales = control.parted(aux) if control else (aux, (), None)
     receive = None if control is None else functools.partial(control.keep, perturbations.points)
     values, outputs = call.values(perturbations.points, references, spare=again is not None, receive=receive)
+    call.rounding(values)
     batch = _Batch(call, x, smoothing, perturbations, with_center, again, values, outputs)
     reduced = batch.from_center() if control is None else None
     if reduced is None:

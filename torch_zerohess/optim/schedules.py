@@ -15,6 +15,7 @@ class LinearSigma:
 
     Large sigmas cross plateaus, small ones find the minimum. As with a scheduler of torch, making it sets the first
     value, each `step()` the next, `get_last_sigma()` returns it, and `state_dict` / `load_state_dict` resume it.
+    It has no optimizer, so `ChainedScheduler` and `SequentialLR` of torch refuse it: call its `step()` beside theirs.
 
     Args:
         module_or_modules: a `BlackBox` or `SparseBlackBox`, a module that contains some, or several of either.

@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 import torch
+from document_texts import TEXTS, blocks
 
 import torch_zerohess as zh
 from truths import vector
@@ -144,3 +145,46 @@ def test_a_state_is_a_copy() -> None:
     state["start"].fill_(9.0)
     schedule.step()
     torch.testing.assert_close(schedule.sigma, torch.full((2,), 0.875, dtype=torch.float64))
+
+
+def test_schedulers_of_torch_step_beside_it_and_refuse_it_inside() -> None:
+    layer, weight = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0)), torch.zeros(1, requires_grad=True)
+    optimizer = torch.optim.SGD([weight], lr=0.8)
+    rate = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.5, total_iters=4)
+    schedule = zh.LinearSigma(layer, 2.0, 1.0, steps=4)
+    with pytest.raises(TypeError, match="should have `optimizer` as its attribute"):
+        torch.optim.lr_scheduler.ChainedScheduler([rate, schedule])
+    with pytest.raises(TypeError, match="should have `optimizer` as its attribute"):
+        torch.optim.lr_scheduler.SequentialLR(optimizer, [rate, schedule], [2])
+    for expected in (0.7, 0.6, 0.5, 0.4):
+        optimizer.step()
+        rate.step()
+        schedule.step()
+        assert rate.get_last_lr() == pytest.approx([expected])
+        assert layer.smoothing.sigma == pytest.approx(2.5 * expected)
+
+
+def test_the_hooks_of_the_guide_resume_a_schedule() -> None:
+    """Two batches, a checkpoint and two batches, with the calls that Lightning makes: a line from 1 to 0.6."""
+    names: dict = {"zh": zh}
+    (code,) = [one for one in blocks(TEXTS["torch_zerohess/README.md"], "python") if "on_train_batch_end" in one]
+    exec(code, names)
+
+    class Model(names["Annealed"]):
+        def __init__(self) -> None:
+            self.layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0))
+            self.annealing = zh.LinearSigma(self.layer, 1.0, 0.5, steps=5)
+
+        def trained(self) -> list[float]:
+            seen = []
+            for batch_idx in range(2):
+                seen.append(self.layer.smoothing.sigma)
+                self.on_train_batch_end(None, None, batch_idx)
+            return seen
+
+    first, checkpoint = Model(), {}
+    seen = first.trained()
+    first.on_save_checkpoint(checkpoint)
+    second = Model()
+    second.on_load_checkpoint(checkpoint)
+    assert seen + second.trained() + [second.layer.smoothing.sigma] == pytest.approx([1.0, 0.9, 0.8, 0.7, 0.6])

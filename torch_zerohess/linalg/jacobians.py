@@ -6,7 +6,7 @@ these vectors need no memory for J: a weight [256, 1 024], 16 samples and 5 outp
 and 147 kB as vectors.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -38,6 +38,15 @@ class Jacobian(Protocol):
         """Return J [M, N]."""
         ...
 
+    def joined(self, join: Callable[[Tensor], Tensor]) -> "Jacobian":
+        """Return J with more samples: `join` adds them to a tensor, along its first dimension."""
+        ...
+
+    @property
+    def layout(self) -> str:
+        """Of what it is made, and its sizes but for the samples: Jacobians to be joined have the same."""
+        ...
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -61,6 +70,13 @@ class Rows:
 
     def dense(self) -> Tensor:
         return self.rows
+
+    def joined(self, join: Callable[[Tensor], Tensor]) -> "Rows":
+        return Rows(join(self.rows))
+
+    @property
+    def layout(self) -> str:
+        return f"rows {list(self.rows.shape[1:])} {self.rows.dtype}"
 
 
 @dataclass(frozen=True)
@@ -93,6 +109,13 @@ class OuterProducts:
     def dense(self) -> Tensor:
         return torch.einsum("bnp,bq->bnpq", self.slopes, self.inputs).flatten(2).flatten(0, 1)
 
+    def joined(self, join: Callable[[Tensor], Tensor]) -> "OuterProducts":
+        return OuterProducts(join(self.slopes), join(self.inputs))
+
+    @property
+    def layout(self) -> str:
+        return f"products {list(self.slopes.shape[1:])} {list(self.inputs.shape[1:])} {self.slopes.dtype}"
+
 
 @dataclass(frozen=True)
 class Blocks:
@@ -118,3 +141,10 @@ class Blocks:
 
     def dense(self) -> Tensor:
         return torch.cat([one.dense() for one in self.parts], 1)
+
+    def joined(self, join: Callable[[Tensor], Tensor]) -> "Blocks":
+        return Blocks([one.joined(join) for one in self.parts], self.sizes)
+
+    @property
+    def layout(self) -> str:
+        return ", ".join(one.layout for one in self.parts)

@@ -69,8 +69,8 @@ class NewtonCG(NewtonStep):
         lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change.
         distributed: whether all processes of `torch.distributed` make the step together, on the mean of their losses:
             each calls the optimizer with its part of the batch, and with equal parameters. Without it, a network in
-            `DistributedDataParallel`, which averages the gradients of `backward` alone, is refused. Not with solver
-            "dual".
+            `DistributedDataParallel`, which averages the gradients of `backward` alone, is refused. With solver "dual"
+            each process gets the Jacobians of all, and solves the system of all outputs.
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
     pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them. For solver
@@ -117,8 +117,6 @@ class NewtonCG(NewtonStep):
             raise ValueError(f"{what} needs curvature 'gauss_newton', got {curvature!r}")
         if solver == "dual" and not damping > 0.0:
             raise ValueError(f"solver 'dual' needs a positive damping, got {damping}")
-        if solver == "dual" and distributed:
-            raise ValueError("solver 'dual' is not distributed: use solver 'steihaug' or 'clip'")
         defaults = {
             "lr": lr,
             "radius": radius,

@@ -54,6 +54,9 @@ class NewtonTargets:
     Every call checks by two more backward passes, of first and of second order, that no loss depends on the outputs of
     another element.
 
+    In several processes each has the targets of its part of the batch. Let `DistributedDataParallel` follow them by the
+    loss above and `backward`; `move_outputs` is of one process.
+
     `state_dict` has the preconditioner, and not the settings. With it, training that was resumed continues to the bit
     for more than 16 outputs, too.
 

@@ -1,14 +1,17 @@
 """Steps that all processes of `torch.distributed` take together, and what keeps one from stepping alone."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 from torch.nn.parallel import DistributedDataParallel
+
+_T = TypeVar("_T")
 
 
 def mean(x: Tensor) -> Tensor:
@@ -23,6 +26,47 @@ def largest(x: Tensor) -> Tensor:
     most = x.clone()
     distributed.all_reduce(most, distributed.ReduceOp.MAX)
     return most
+
+
+def joined(x: Tensor) -> Tensor:
+    """Return the rows of all processes, one process after the other, for x [rows, ...]: rows may differ in number."""
+    counts = [torch.empty(1, dtype=torch.int64, device=x.device) for _ in range(distributed.get_world_size())]
+    distributed.all_gather(counts, torch.full_like(counts[0], len(x)))
+    rows = [int(one) for one in counts]
+    padded = x.new_zeros(max(rows), *x.shape[1:])
+    padded[: len(x)] = x
+    parts = [torch.empty_like(padded) for _ in rows]
+    distributed.all_gather(parts, padded)
+    return torch.cat([part[:count] for part, count in zip(parts, rows, strict=True)])
+
+
+def of_first(x: Tensor) -> Tensor:
+    """Return x of the first process, to the last bit, in all of them."""
+    result = x.clone()
+    distributed.broadcast(result, 0)
+    return result
+
+
+def together(call: Callable[[], _T], device: torch.device) -> _T:
+    """Return the result of a call without communication. If it fails in one process, raise in all of them."""
+    error: Exception | None = None
+    try:
+        result = call()
+    except (RuntimeError, TypeError, ValueError) as raised:
+        error = raised
+    failed = largest(torch.tensor(float(error is not None), device=device))
+    if error is not None:
+        raise error
+    if bool(failed):
+        raise RuntimeError("another process cannot make the step, and raises the error that says why")
+    return result
+
+
+def check_same(text: str, device: torch.device, message: str) -> None:
+    """Raise ValueError with a message, in all processes, if a text differs between them."""
+    number = torch.tensor(float(zlib.crc32(text.encode())), dtype=torch.float64, device=device)
+    if float(largest(number)) != -float(largest(-number)):
+        raise ValueError(message)
 
 
 def check_started() -> None:

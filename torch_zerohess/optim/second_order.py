@@ -19,7 +19,8 @@ from torch_zerohess.linalg.flat import add_parts, flattened, overwrite, split_li
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.step import Step
-from torch_zerohess.optim import processes
+from torch_zerohess.optim import dual_system, processes
+from torch_zerohess.optim.dual_system import DualSystem
 from torch_zerohess.optim.outside import check_inside
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], SampleJacobian]
@@ -97,14 +98,19 @@ class Model:
 
     def dual_step(self, radius: float, damping: float) -> Step | None:
         """Return the step of `linalg.dual.dual_step` for the mean of the losses; None where A is indefinite."""
-        A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
-        J, sampled = self._white_box, self._jacobian is not None
-        g = check_inside(J, self._operators, self.gradient, sampled=sampled)
+        all_of = dual_system.joined(self._system, self.loss.device) if self._distributed else self._system()
         if self._blocks is None:
-            values = torch.linalg.eigvalsh(A)
+            values = torch.linalg.eigvalsh(all_of.A)
             if float(values[0]) < -_INDEFINITE * torch.finfo(self.loss.dtype).eps * float(values.abs().max()):
                 return None
-        return dual_step(J, A, g, radius, damping)
+        return (dual_system.same_step if self._distributed else dual_step)(*all_of, radius, damping)
+
+    def _system(self) -> DualSystem:
+        """The system of this process."""
+        A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
+        J, sampled = self._white_box, self._jacobian is not None
+        gradient = torch.stack([one.gradient for one in self._operators]).double().mean(0)
+        return DualSystem(J, A, check_inside(J, self._operators, gradient, sampled=sampled))
 
     @cached_property
     def _white_box(self) -> Jacobian:

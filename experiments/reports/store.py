@@ -1,5 +1,6 @@
 """`python -m experiments store DIR --name NAME`: the medians of a folder of results as a table that documents quote."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -31,12 +32,14 @@ def store(
     tasks: tuple[str, ...] = (),
     levels: tuple[float, ...] = LEVELS,
     add: bool = False,
+    failed: bool = False,
 ) -> None:
     """Write the medians of a folder of results, with their origin, to experiments/results/NAME.csv.
 
     A fitting task has a row per method, error and level. A task that trains a network has a row per method. Rows say
     how many evaluations a run may use (`evaluation_limit`) and how many runs the limit of time ended. Refused if
-    the runs are of several commits, of code with changes, of several machines, presets or limits, or not finished.
+    the runs are of several commits, of code with changes, of several machines, presets or limits, or not finished, or
+    if a run failed: an exception, as of a file that is missing, says nothing about a method.
     A task with a measure of its own, as the silhouettes of MESHFIT, has its median and least value where runs ended. A
     task that trains a network has the median and the worst value of its measure, as the decibels of CNN-TEXTURE.
 
@@ -46,6 +49,7 @@ def store(
         tasks: only these; all of the folder if not given.
         levels: by how much an error is reduced, as a share of the first one; for tasks that are fitted.
         add: keep the other tasks of a stored table; refused if its commit, machine or protocol is another one.
+        failed: keep runs that failed, as runs that did not get there, and print why they failed.
     """
     if not levels or not all(0.0 < one <= LEVELS[-1] for one in levels):
         raise SystemExit(f"levels must be above 0 and at most {LEVELS[-1]:g}, where runs end, got {levels}")
@@ -57,6 +61,7 @@ def store(
         raise SystemExit(f"tasks must all be fitted or all train a network, got {', '.join(wanted)}")
     if count := results.unfinished.total():
         raise SystemExit(f"{count} runs in {folder} are unfinished: the same `run` goes on with them")
+    _check_failed(results, keep=failed)
     known = read_command(folder)
     whence = result_files.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
     preset = whence["preset"]
@@ -65,6 +70,28 @@ def store(
     print(result_files.write(_added(table, name) if add else table, name))
     if left := [task for task in there.runs if task not in wanted]:
         print(f"left out, although the command ran them: {', '.join(left)}")
+
+
+def _check_failed(results: Results, *, keep: bool) -> None:
+    """Print which runs failed, and their exceptions; SystemExit if they are not to be kept."""
+    found = Counter(
+        f"{method} on {task}: {run.outcome.reason}"
+        for task, methods in results.runs.items()
+        for method, runs in methods.items()
+        for run in runs
+        if run.outcome.status == "failed"
+    )
+    if not found:
+        return
+    text = "\n".join(
+        [f"{found.total()} runs in {results.folder} failed:", *(f"{n} of {one}" for one, n in found.items())]
+    )
+    if not keep:
+        raise SystemExit(
+            f"{text}\nDelete RUN.json and RUN.jsonl of these in TASK/METHOD, then the same `run` makes them again; or "
+            "give --failed, which keeps them as runs that did not get there"
+        )
+    print(text)
 
 
 def _added(table: pd.DataFrame, name: str) -> pd.DataFrame:

@@ -132,7 +132,7 @@ def test_networks_have_a_row_per_method(tmp_path, results):
     _remember(held_out("cnn", ended[1:]), folder / "cnn" / HELD_OUT)
     files = Files(folder / "cnn" / "memory_adam", 2)
     write_outcome(replace(read_outcome(files.outcome), status="failed"), files)
-    store(folder, name="networks")
+    store(folder, name="networks", failed=True)
     (row,) = rows(results, "networks")
     assert [float(row[one]) for one in ("renders", "seconds")] == [20.0, 1.0]
     assert float(row["parameter_divided"]) == (400 + 64) / 2  # of the two runs that did not fail
@@ -273,8 +273,29 @@ def test_runs_without_a_limit_go_together(tmp_path, results):
 def test_a_run_whose_process_died_does_not_hide_the_number_of_parameters(folder, results):
     files = Files(folder / "bowl" / "fr22", 3)
     write_outcome(replace(read_outcome(files.outcome), status="failed", x=[]), files)
-    store(folder, name="bowls")
+    store(folder, name="bowls", failed=True)
     assert {one["n"] for one in rows(results, "bowls")} == {"2"}
+
+
+def test_runs_that_failed_are_kept_only_if_that_is_asked_for(folder, results, capsys):
+    """A run that failed counts among those that did not get there."""
+    reason = "FileNotFoundError: No such file or directory: 'mug.ply'"
+    for run in (4, 5):
+        files = Files(folder / "bowl" / "fr22", run)
+        write_outcome(replace(read_outcome(files.outcome), status="failed", reason=reason), files)
+    write(folder, "dish", "fr22", 3, [100.0, 0.5], each=2)
+    said = f"2 runs in {folder} failed:\n2 of fr22 on bowl: {reason}\n"
+    with pytest.raises(SystemExit, match=re.escape(said)):
+        store(folder, name="bowls")
+    assert not (results / "bowls.csv").exists()
+    store(folder, name="dishes", tasks=("dish",))
+    assert "fr22 on bowl" not in capsys.readouterr().out
+    store(folder, name="bowls", failed=True)
+    assert said in capsys.readouterr().out
+    kept = {
+        (one["task"], one["method"], one["level"]): one for one in rows(results, "bowls") if one["metric"] == "image"
+    }
+    assert (kept["bowl", "fr22", "99"]["reached"], kept["bowl", "fr22", "99"]["runs"]) == ("1", "3")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """What `minimize` refuses: the error names the argument and its value, and comes before the first evaluation."""
 
 import inspect
+import itertools
 import math
+import re
 import typing
 
 import numpy as np
@@ -198,3 +200,15 @@ def test_signatures_name_types_and_do_not_spell_them_out(door):
     assert "Array" not in said
     hints = typing.get_type_hints(door if door is zh.minimize else door.__init__)
     assert hints["bounds"] == Bounds | None
+
+
+@pytest.mark.parametrize("returned", [(2,), (3, 1), (), (0,)])
+def test_an_output_of_another_shape_than_before_is_named_with_its_point(returned):
+    shapes = itertools.chain([(3,)] * 8, itertools.repeat(returned))
+    message = (
+        rf"^fn must return values of one shape, got {re.escape(str([*returned]))} at the point \[.+, .+\] and \[3\] "
+    )
+    with pytest.raises(ValueError, match=message):
+        zh.minimize(
+            lambda x: torch.ones(next(shapes)) * x.sum(), [0.5, 0.5], sigma=0.3, loss=torch.sum, vectorized=False
+        )

@@ -11,6 +11,7 @@ from searches import TARGET, hill_fit, raising, tilted, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators.returned import ReturnedError
+from torch_zerohess.minimization import record
 from torch_zerohess.minimization.failure import failure
 from truths import vector
 
@@ -320,6 +321,43 @@ def test_fifty_equal_values_are_a_warning_and_the_search_goes_on(fn, loss, said)
     assert len(noted) == 1
     assert noted[0].filename == __file__
     assert fit.evaluations == 120
+
+
+def bar(x):  # [K, 2] -> [K, 16]
+    return (torch.linspace(0, 1, 16) - x[:, :1]).abs() * (1 + x[:, 1:])
+
+
+def rounded(y):
+    return (y.round(decimals=1) - 0.3).square().mean()
+
+
+def test_a_loss_that_rounds_is_a_warning_and_the_search_goes_on():
+    settings = {"sigma": 0.3, "seed": 0, "bounds": (-1, 1)}
+    zh.minimize(bar, zeros(2), max_evaluations=19, loss=rounded, **settings)  # a warning is an error
+    with pytest.warns(
+        UserWarning, match="a derivative of zero at all 20 outputs .* the black box return the loss"
+    ) as noted:
+        fit = zh.minimize(bar, zeros(2), max_evaluations=40, loss=rounded, **settings)
+    assert (len(noted), noted[0].filename, fit.evaluations) == (1, __file__, 40)
+    settings["max_evaluations"] = 40
+    zh.minimize(bar, zeros(2), loss=lambda y: rounded(y) + 1e-9 * y[0], **settings)  # a slope somewhere
+
+    def failing(x):
+        return bar(x).where(x[:, :1] < 0.1, torch.nan)
+
+    fit = zh.minimize(failing, zeros(2), loss=lambda y: 1 + 0 * y.sum(), **settings)  # the losses do not differ
+    assert fit.message.count("not finite")
+    with pytest.raises(ValueError, match="a loss that thresholds or rounds belongs in the black box"):
+        zh.minimize(bar, zeros(2), loss=lambda y: (y > 0.5).double().mean(), **settings)
+
+
+def test_a_loss_of_a_few_large_outputs_is_looked_at(monkeypatch):
+    settings = {"sigma": 0.3, "seed": 0, "bounds": (-1, 1), "loss": rounded, "max_evaluations": 40}
+    monkeypatch.setattr(record, "_HELD", 5 * 16)
+    with pytest.warns(UserWarning, match="a derivative of zero at all 5 outputs"):
+        zh.minimize(bar, zeros(2), **settings)
+    monkeypatch.setattr(record, "_HELD", 4 * 16)
+    zh.minimize(bar, zeros(2), **settings)
 
 
 def test_fortynine_equal_values_are_none():

@@ -131,8 +131,7 @@ class OnnxFunction:
         """
         check_tensors(x=x, aux=aux)
         if x.ndim != 2 or x.shape[1] != self.n:
-            parts = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())
-            raise ValueError(f"x must have shape [K, {self.n}] for {parts}, got {list(x.shape)}")
+            raise ValueError(self._misshapen(x))
         if len(aux) != len(self.aux):
             raise ValueError(f"aux must be {len(self.aux)} tensors for {list(self.aux)}, got {len(aux)}")
         self._check_rounding(x)
@@ -148,6 +147,19 @@ class OnnxFunction:
             return values.to(x.device)
         rows = [self._one(x[k : k + 1], tuple(one[k : k + 1] for one in aux)) for k in range(len(x))]
         return torch.stack(rows).to(x.device) if rows else x.new_empty(0)
+
+    def _misshapen(self, x: Tensor) -> str:
+        """Return the message for x that does not have one row of n numbers per point."""
+        parts = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())
+        said = f"x must have shape [K, {self.n}] for {parts}, got {list(x.shape)}"
+        first = {
+            0 if _free(self._inputs[name].shape[:1]) else max(shape[:1], default=0)
+            for name, shape in self.shapes.items()
+        }
+        if len(first) == 1 and x.shape[-1] * (batch := first.pop()) == self.n and batch > 1:
+            return f"{said}: the batch of {batch} is fixed, and part of a point; export the model with a free batch"
+        widths = [shape[-1] for shape in self.shapes.values() if len(shape) > 1]
+        return f"{said}; flatten each image, as x.flatten(1)" if x.shape[-1] in widths else said
 
     def _check_rounding(self, x: Tensor) -> None:
         """Raise ValueError for points that differ, but not one of them after the conversion."""
@@ -244,7 +256,8 @@ class OnnxFunction:
             if not self._type(name).is_floating_point:
                 raise ValueError(
                     f"parameters: input {name!r} is {self._inputs[name].type}, and x is real: give it as one of "
-                    "constants or aux, or put a Cast before it in the model"
+                    "constants or aux, put a Cast before it in the model, or write fn yourself: round x, and call "
+                    "session.run of onnxruntime"
                 )
 
     def _output(self, name: str | None) -> str:

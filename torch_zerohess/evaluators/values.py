@@ -22,7 +22,7 @@ def stacked(rows: Any) -> Any:
     """
     if not isinstance(rows, (list, tuple)):
         return rows
-    rows = filled_rows(rows)
+    rows = filled_rows([one if isinstance(one, (int, float)) else _as_array(one) for one in rows])
     kind = type(leaf(rows))
     numpy: Any = sys.modules.get("numpy")
     arrays = numpy is not None and issubclass(kind, numpy.ndarray)
@@ -37,6 +37,15 @@ def stacked(rows: Any) -> Any:
                 f"rows must have one shape, got {[*one.shape]} for row {k} and {[*parts[0].shape]} before"
             )
     return _known(numpy.asarray([_unmasked(one) for one in parts])) if arrays else torch.stack(parts)
+
+
+def _as_array(result: Any) -> Any:
+    """Return a picture of Pillow, or a table of pandas, as an array of NumPy, and anything else as it is."""
+    numpy: Any = sys.modules.get("numpy")
+    if numpy is None or isinstance(result, (Tensor, numpy.ndarray, numpy.generic)):
+        return result
+    on_host = hasattr(result, "__array__") and not hasattr(result, "__dlpack__")
+    return numpy.asarray(result) if on_host or hasattr(result, "__array_interface__") else result
 
 
 def _unmasked(array: Any) -> Any:
@@ -65,9 +74,9 @@ def leaf(result: Any) -> Any:
 def as_tensor(result: Any) -> Tensor:
     """Return what a black box returned as a tensor of real or complex numbers.
 
-    A list of tensors or arrays of one shape is stacked; a single NaN in it stands for a whole one. Numbers of Python
-    are float64, alone and in lists, and so are integers and truth values of any kind: counts, images of
-    bytes, a loss that is 0 on a plateau. Masked entries of a NumPy array are NaN. Sparse tensors are filled.
+    A list of tensors, arrays or pictures of one shape is stacked; a single NaN in it stands for a whole one. Numbers of
+    Python are float64, alone and in lists, and so are integers and truth values of any kind: counts, images of bytes, a
+    loss that is 0 on a plateau. Masked entries of a NumPy array are NaN. Sparse tensors are filled.
     """
     if isinstance(result, Mapping):
         names = ", ".join(map(repr, itertools.islice(result, _SHOWN))) + (", ..." if len(result) > _SHOWN else "")
@@ -80,8 +89,8 @@ def as_tensor(result: Any) -> Tensor:
         if isinstance(result, Tensor):
             result = result if result.layout is torch.strided else result.to_dense()
             return result if result.is_floating_point() or result.is_complex() else result.double()
-        numpy = sys.modules.get("numpy")
-        if numpy is not None and hasattr(result, "__array_interface__"):
+        result = _as_array(result)
+        if hasattr(result, "__array_interface__"):
             result = _known(_unmasked(result))
         first = leaf(result)
         # Arrays that are on no GPU go to the CPU, whatever the default device of torch.
@@ -105,7 +114,7 @@ def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tens
     if vectorized and isinstance(result, tuple) and any(getattr(one, "ndim", 0) > 0 for one in result):
         raise ReturnedTypeError(
             f"fn must return one tensor [K, *out], got a tuple of {len(result)}: return one of them, or join them "
-            "along dimension 1"
+            "along dimension 1" + ("; one value per point may be a list" if len(result) == len(points) else "")
         )
     values = as_tensor(result)
     if values.requires_grad:

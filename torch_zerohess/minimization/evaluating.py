@@ -21,11 +21,12 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
     Args:
         call: the black box.
         memory: gets every evaluation; or None.
-        scalar: whether each value must be one number. The call raises ValueError for others.
+        scalar: whether each value must be one number. The call raises ValueError for others, and for outputs of another
+            shape than before.
     """
 
     def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
-        given, failure = points.clone(), None
+        given, before, failure = points.clone(), call.latest, None
         numbers = list(range(len(points)))
         try:
             values = call(given, ())
@@ -40,6 +41,11 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
             raise failure or ReturnedValueError(
                 f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
                 f"{len(points)} points"
+            )
+        if failure is None and before is not None and values.shape[1:] != before.shape[1:]:
+            raise ReturnedValueError(
+                f"fn must return values of one shape, got {list(values.shape[1:])} at the point "
+                f"[{numbers_of(points[0])}] and {list(before.shape[1:])} before"
             )
         if memory is not None and numbers:
             with memory.lock:

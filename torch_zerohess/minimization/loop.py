@@ -3,7 +3,7 @@
 import contextlib
 
 from torch_zerohess.minimization.callback import Callback
-from torch_zerohess.minimization.constant import warn_of_constant
+from torch_zerohess.minimization.constant import warn_of_constant, warn_of_steps
 from torch_zerohess.minimization.failure import failure
 from torch_zerohess.minimization.measured_derivatives import measure
 from torch_zerohess.minimization.minimum import Status
@@ -55,6 +55,7 @@ def _end(running: Running, stopping: Stopping, callback: Callback | None) -> End
         if end is None:
             running.step()
             warn_of_constant(running.record, seen)
+            warn_of_steps(running.record, running.search.loss)
             seen = running.record.complete
             continue
         if end[0] == "solved" and not running.noise:

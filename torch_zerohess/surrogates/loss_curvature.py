@@ -45,8 +45,9 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
         value = loss(y)
         if not value.requires_grad:
             raise ValueError(
-                "loss must be differentiable by torch, got a value that does not depend on its output; where it is "
-                "constant, add 0 * output.sum()"
+                "loss must be differentiable by torch, got a value that does not depend on its output: a loss that "
+                "thresholds or rounds belongs in the black box, which then returns the loss. Only where a loss is "
+                "constant in parts, add 0 * output.sum()"
             )
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
 

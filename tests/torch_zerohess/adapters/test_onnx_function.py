@@ -146,7 +146,7 @@ def test_wrong_names(settings, message):
 
 
 def test_wrong_inputs():
-    with pytest.raises(ValueError, match=r"input 'x' is tensor\(int64\), and x is real: give it as one of constants"):
+    with pytest.raises(ValueError, match=r"input 'x' is tensor\(int64\), and x is real: .* round x, and call session"):
         OnnxFunction(model(kind=TensorProto.INT64), ["x"], constants={"c": C[0]}, output="y")
     f = OnnxFunction(model(kind=TensorProto.INT64), ["c"], constants={"x": torch.tensor([1, 2])}, output="y")
     torch.testing.assert_close(f(C), truth(torch.tensor([1, 2]), C))
@@ -189,6 +189,40 @@ def test_a_model_that_mixes_the_points_of_a_batch_is_refused(nodes):
     for _ in range(2):
         with pytest.raises(ValueError, match="output 'y' must depend on its own point alone"):
             f(Z)
+
+
+def test_an_output_whose_batch_is_another_dimension_is_refused_where_the_sizes_agree_by_chance():
+    """Two points of two numbers: the transposed output has the shape of a right one. So has x^T x, for each K."""
+    transposed = helper.make_node("Transpose", ["x"], ["t"], perm=[1, 0])
+    of_columns = of_node(transposed, helper.make_node("Identity", ["t"], ["y"]))
+    products = of_node(transposed, helper.make_node("MatMul", ["t", "x"], ["y"]))
+    with pytest.raises(
+        ValueError, match=r"output 'y' must depend on its own point alone, .* the batch is not dimension"
+    ):
+        OnnxFunction(of_columns)(Z[:2])
+    with pytest.raises(
+        ValueError, match=r"must have one value per point, but is \[2, 2\] for 2 points and \[2, 2\] for one"
+    ):
+        OnnxFunction(products)(Z[:2])
+    squeezed = of_node(helper.make_node("Squeeze", ["x"], ["y"]))  # a point alone is [2], not [1, 2]
+    assert torch.equal(OnnxFunction(squeezed)(Z), Z.float())
+
+
+def test_points_of_another_shape_than_x_are_told_what_to_do():
+    with pytest.raises(
+        ValueError, match=r"x must have shape \[K, 10\] for x \[5, 2\], got \[5, 2\]: the batch of 5 is fixed"
+    ):
+        OnnxFunction(model(5), ["x"], constants={"c": C}, output="y")(Z)
+    value = helper.make_tensor_value_info
+    ends = [[value(name, TensorProto.FLOAT, ["K", 1, 4, 3])] for name in "xy"]
+    graph = helper.make_graph([helper.make_node("Tanh", ["x"], ["y"])], "image", *ends)
+    image = OnnxFunction(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10))
+    with pytest.raises(
+        ValueError, match=r"x must have shape \[K, 12\] for x \[1, 4, 3\], got \[8, 3\]; flatten each image"
+    ):
+        zh.BlackBox(image, zh.Smoothing(sigma=0.1))(torch.zeros(2, 1, 4, 3))
+    with pytest.raises(ValueError, match=r"got \[2, 5\]$"):
+        image(torch.zeros(2, 5))
 
 
 @pytest.mark.parametrize("out", [(), (1,), (0,)])

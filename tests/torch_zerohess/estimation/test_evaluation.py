@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate, sparse_jacobian
@@ -286,6 +288,28 @@ def test_a_list_of_rows_is_stacked(rows: Callable[[Tensor], Any]) -> None:
         got = estimate(rows, X, S).gradient
     same = estimate(lambda z: torch.stack([z.sum(1), z[:, 0].square()], 1), X, S).gradient
     torch.testing.assert_close(got.reshape(same.shape), same, rtol=1e-5, atol=1e-5)
+
+
+def test_pictures_and_tables_are_arrays() -> None:
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+    pictures = [Image.fromarray(one) for one in pixels]
+    assert torch.equal(as_tensor(pictures[0]), torch.from_numpy(pixels[0]).double())
+    assert torch.equal(as_tensor(pictures), torch.from_numpy(pixels).double())
+    missing = as_tensor([math.nan, pictures[1]])
+    assert missing[0].isnan().all()
+    assert torch.equal(missing[1], torch.from_numpy(pixels[1]).double())
+    table = pandas.DataFrame(pixels[0], columns=["a", "b", "c", "d"], index=[7, 8, 9])
+    assert torch.equal(as_tensor(table), torch.from_numpy(pixels[0]).double())
+    assert torch.equal(as_tensor([table["a"], table["b"]]), torch.from_numpy(pixels[0, :, :2].T.copy()).double())
+
+
+def test_a_tuple_with_a_value_for_each_point_is_told_to_be_a_list() -> None:
+    z = torch.rand(3, 2)
+    with pytest.raises(TypeError, match=r"a tuple of 3: return one .* dimension 1; one value per point may be a list$"):
+        checked_values(tuple(z), z)
+    with pytest.raises(TypeError, match=r"a tuple of 2: return one of them, or join them along dimension 1$"):
+        checked_values((z, z), z)
+    assert torch.equal(checked_values(list(z), z), z)
 
 
 @pytest.mark.parametrize("count", [2, 17])

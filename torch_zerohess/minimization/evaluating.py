@@ -26,7 +26,8 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
     """
 
     def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
-        given, before, failure = points.clone(), call.latest, None
+        given, failure = points.clone(), None
+        before = call.latest
         numbers = list(range(len(points)))
         try:
             values = call(given, ())

@@ -22,7 +22,8 @@ def stacked(rows: Any) -> Any:
     """
     if not isinstance(rows, (list, tuple)):
         return rows
-    rows = filled_rows([one if isinstance(one, (int, float)) else _as_array(one) for one in rows])
+    rows = [one if isinstance(one, (int, float)) else _as_array(one) for one in rows]
+    rows = filled_rows(rows)
     kind = type(leaf(rows))
     numpy: Any = sys.modules.get("numpy")
     arrays = numpy is not None and issubclass(kind, numpy.ndarray)

@@ -15,10 +15,10 @@ LAYERS = {
     "torch_zerohess": [
         *(
             "version",
+            "wrappers",
             "arguments",
             "precision",
             "threads",
-            "wrappers",
             "evaluation_mode",
             "choice",
             "smoothing",

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.version import written_by
+from torch_zerohess.wrappers import differentiated, mapped
 
 
 def check_callable(**arguments: Any) -> None:
@@ -83,7 +84,7 @@ def checked_integer(name: str, value: Any, least: int | None = None) -> int:
     """Return an integer as one of Python. TypeError if it is none, ValueError if it is below `least`."""
     try:
         number = None if isinstance(value, bool) else operator.index(value)
-    except TypeError:
+    except (TypeError, RuntimeError):  # RuntimeError: a tensor that vmap maps over
         number = None
     if number is None:
         raise TypeError(f"{name} must be an integer, got {value!r}")
@@ -165,9 +166,12 @@ def own_copy(numbers: Any) -> Any:
 
 
 def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
-    """Return a number, or a copy [n] in float64. TypeError if sigma is neither, ValueError if it is out of range."""
-    if isinstance(sigma, Tensor) and sigma.requires_grad:
-        raise ValueError(f"{name} must not require grad: pass {name}.detach()")
+    """Return a number, or a copy [n] in float64. TypeError if sigma is neither, ValueError if it is out of range.
+
+    ValueError, too, if sigma or one of its numbers is differentiated, or mapped over by `torch.vmap`.
+    """
+    for one in sigma if isinstance(sigma, (tuple, list)) else (sigma,):
+        _check_constant(name, one)
     try:
         values = sigma if isinstance(sigma, Tensor) else _numbers(sigma)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -180,3 +184,17 @@ def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
     if len(wrong):
         raise ValueError(f"{name} must be positive and finite, got {float(wrong.flatten()[0])}")
     return float(values) if values.dim() == 0 else values
+
+
+def _check_constant(name: str, value: Any) -> None:
+    """Raise ValueError for a tensor that is differentiated or mapped over: settings have neither."""
+    if not isinstance(value, Tensor):
+        return
+    if value.requires_grad:
+        raise ValueError(f"{name} must not require grad: pass {name}.detach()")
+    if differentiated(value):
+        raise ValueError(f"{name} must not be differentiated, in forward mode either: pass {name}.detach()")
+    if mapped(value):
+        raise ValueError(
+            f"{name} must not be mapped over by vmap: call one layer after the other, each with its {name}"
+        )

@@ -1,4 +1,4 @@
-"""Which tensors are wrappers that a transform of torch has handed out, and which of them are differentiated."""
+"""Which tensors are wrappers that a transform of torch has handed out, and which are mapped over or differentiated."""
 
 import torch
 from torch import Tensor
@@ -12,6 +12,17 @@ def readable(tensor: Tensor) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def mapped(tensor: Tensor) -> bool:
+    """Whether `torch.vmap` maps over a tensor: of all wrappers, only those of vmap give no numbers."""
+    if readable(tensor):
+        return False
+    try:
+        tensor.sum().item()
+    except RuntimeError:
+        return True
+    return False
 
 
 def differentiated(tensor: Tensor) -> bool:

@@ -79,3 +79,42 @@ def test_settings_that_serve_one_parameter_alone_are_made():
     assert settings.resolved(1).scrambles == 2
     with pytest.raises(ValueError, match=r"samples must be even, .*got samples=7"):
         settings.resolved(2)
+
+
+def smoothed(sigma, x):
+    """F of the sum of squares at x."""
+    return zh.BlackBox(lambda z: z.square().sum(1), zh.Smoothing(sigma=sigma, samples=4, seed=0), value="smoothed")(x)
+
+
+@pytest.mark.parametrize(
+    "derivative",
+    [
+        torch.func.grad(lambda s: smoothed(s, torch.ones(2))),
+        torch.func.jacfwd(lambda s: smoothed(s, torch.ones(2))),
+        torch.func.jacfwd(lambda s: smoothed(s, s * torch.ones(2))),
+        torch.func.grad(lambda s: smoothed([s, 2 * s], torch.ones(2))),
+        torch.func.jacfwd(lambda s: smoothed((s, 2 * s), torch.ones(2))),
+    ],
+    ids=["grad", "jacfwd", "jacfwd also of x", "grad of a list", "jacfwd of a tuple"],
+)
+def test_derivatives_by_sigma_are_refused(derivative):
+    """F of the sum of squares has the derivative 2 n sigma, and no layer has it: zero would be wrong."""
+    with pytest.raises(ValueError, match=r"sigma must not (require grad|be differentiated).*: pass sigma.detach\(\)"):
+        derivative(torch.tensor(0.3))
+
+
+def test_a_sigma_that_is_detached_inside_of_a_transform_is_a_number():
+    """Of a linear f on 4 pairs of the same samples, the slope by s of f(s v) is v times its slope by x."""
+    f = zh.BlackBox(lambda z: 3 * z.sum(1), zh.Smoothing(sigma=0.3, samples=4, seed=0))
+    slope = torch.func.grad(f)(torch.tensor([1.0]))
+    moved = lambda s: zh.BlackBox(  # noqa: E731
+        lambda z: 3 * z.sum(1), zh.Smoothing(sigma=s.detach(), samples=4, seed=0)
+    )(s * torch.tensor([2.0]))
+    torch.testing.assert_close(torch.func.jacfwd(moved)(torch.tensor(0.3)), 2 * slope[0])
+
+
+def test_settings_that_vmap_maps_over_are_refused():
+    with pytest.raises(ValueError, match="sigma must not be mapped over by vmap: call one layer after the other"):
+        torch.func.vmap(lambda s: smoothed(s, torch.ones(2)))(torch.tensor([0.3, 0.4]))
+    with pytest.raises(TypeError, match="seed must be an integer, got BatchedTensor"):
+        torch.func.vmap(lambda s: torch.tensor(zh.Smoothing(sigma=0.3, seed=s).seed))(torch.tensor([3, 4]))

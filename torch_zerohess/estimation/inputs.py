@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.fx import Proxy
 
-from torch_zerohess.wrappers import differentiated, readable
+from torch_zerohess.wrappers import differentiated, mapped
 
 NO_GRAPH = "an estimate has no graph: use smooth(fn, smoothing)"
 _FEW = 64  # numbers up to which Python is faster than an operation of torch
@@ -45,22 +45,13 @@ def check_no_derivative(instead: str, **given: Tensor) -> None:
     instead: end of the message, which says what has no graph and what to use.
     """
     for name, one in given.items():
-        _check_not_mapped(name, one)
+        if mapped(one):
+            raise ValueError(
+                f"{name} must not be mapped over by vmap: give a batch [*batch, n] in one call, where that is "
+                "possible; smooth has vmap"
+            )
         if differentiated(one):
             raise ValueError(f"{name} is differentiated, and {instead}")
-
-
-def _check_not_mapped(name: str, x: Tensor) -> None:
-    """Raise ValueError if `torch.vmap` maps over x: of all wrappers, only those of vmap give no numbers."""
-    if readable(x):
-        return
-    try:
-        x.sum().item()
-    except RuntimeError as error:
-        raise ValueError(
-            f"{name} must not be mapped over by vmap: give a batch [*batch, n] in one call, where that is possible; "
-            "smooth has vmap"
-        ) from error
 
 
 def _check_not_nested(name: str, x: Tensor) -> None:

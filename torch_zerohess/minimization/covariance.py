@@ -8,8 +8,9 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer
 
 _REMEDY = (
-    "x may be no minimum, or the data do not determine this parameter beside the others; hold it at its value by "
-    "fixed=[{}], or give further data or a prior"
+    "x may be no minimum, or the data do not determine this parameter beside the others, or the Hessian is not known "
+    "well enough; hold it at its value by fixed=[{}], give further data or a prior, or search again from x with loss=, "
+    "bounds, restarts=0 and a smaller sigma"
 )
 
 
@@ -60,7 +61,8 @@ def _inverse(hessian: Tensor, errors: Tensor, names: list[int]) -> Tensor:
         i = names[int(errors.isinf().int().argmax())]
         raise ValueError(
             "the error of the Hessian must be known for a covariance, but too few evaluations near x vary parameter "
-            f"{i}: give more max_evaluations, or hold it at its value by fixed=[{i}]"
+            f"{i}: search again from x with restarts=0 and a smaller sigma, or hold it at its value by fixed=[{i}] or, "
+            "if the data do not determine it, from the start of the search"
         )
     C = torch.cholesky_inverse(factor) / (size[:, None] * size)
     shares = errors.double() * C.diagonal()

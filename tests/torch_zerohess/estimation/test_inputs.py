@@ -35,6 +35,7 @@ SETTINGS = [
     ({"sigma": torch.ones(0)}, TypeError, r"sigma must be a positive number or a tensor \[n\]"),
     ({"sigma": torch.ones(2, dtype=torch.complex64)}, TypeError, "sigma must be a positive number"),
     ({"sigma": torch.ones(2, requires_grad=True)}, ValueError, r"sigma must not require grad.*detach"),
+    ({"sigma": [1.0, torch.tensor(2.0, requires_grad=True)]}, ValueError, r"sigma must not require grad.*detach"),
     ({"sigma": "wide"}, TypeError, r"sigma must be a positive number.*'wide'"),
     ({"sigma": None}, TypeError, r"sigma must be a positive number.*None"),
     ({"sigma": True}, TypeError, r"sigma must be a positive number.*True"),

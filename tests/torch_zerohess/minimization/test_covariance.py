@@ -68,7 +68,11 @@ def test_parameters_in_very_different_units() -> None:
         ([[1.0, 0.0], [0.0, -0.1]], [0.0, 0.0], "eigenvalue -1, mostly along parameter 1"),
         ([[0.0, 0.0], [0.0, 1.0]], [0.0, 0.0], "eigenvalue 0, mostly along parameter 0"),
         ([[1.0, 0.0], [0.0, 4.0]], [0.5, 4.0], r"within its errors .* parameter 1, 0\.25, may be wrong by 1 of itself"),
-        ([[1.0, 0.0], [0.0, 4.0]], [float("inf"), 0.0], r"too few evaluations near x vary parameter 0: .* fixed=\[0\]"),
+        (
+            [[1.0, 0.0], [0.0, 4.0]],
+            [float("inf"), 0.0],
+            r"too few evaluations near x vary parameter 0: search again .* fixed=\[0\]",
+        ),
         ([[1.0, float("nan")], [0.0, 4.0]], [0.0, 0.0], "must be finite"),
     ],
 )
@@ -138,3 +142,22 @@ def test_a_hessian_that_is_not_known() -> None:
     fit = replace(fitted(decay, outputs=False), hessian=None)
     with pytest.raises(ValueError, match="not known, too few evaluations"):
         fit.covariance()
+
+
+def two_decays(x):
+    """[K, 4] -> [K, 30]."""
+    return decay(x[:, :2]) + decay(x[:, 2:])
+
+
+def test_a_search_from_x_with_a_small_sigma_knows_a_nearly_singular_hessian() -> None:
+    """The first search has an error of the Hessian that hides its smallest eigenvalue."""
+    start = torch.tensor([1.0, 1.0, 0.7, 2.0]).double()
+    data = two_decays(start[None])[0] + 1e-3 * normal(30)
+    loss = lambda y: 0.5 * ((y - data) / 1e-3).square().sum()  # noqa: E731
+    settings = {"loss": loss, "bounds": (0, 5), "restarts": 0, "seed": 0}
+    fit = zh.minimize(two_decays, start + 0.05, sigma=0.1, **settings)
+    with pytest.raises(ValueError, match="search again from x with loss=, bounds, restarts=0 and a smaller sigma"):
+        fit.covariance()
+    again = zh.minimize(two_decays, fit.x, sigma=1e-4, **settings)
+    truth = torch.linalg.inv(torch.func.hessian(lambda x: loss(two_decays(x[None])[0]))(again.x))
+    torch.testing.assert_close(again.covariance(), truth, rtol=0.02, atol=0)

@@ -1,24 +1,30 @@
 """Derivatives from evaluations on all sides of the point where a search has ended.
 
 A Gaussian process of outputs evaluates where it expects the minimum, and seldom on all sides of it. The nearest
-evaluations may lie nearly on a line. So a search that has found the minimum evaluates two further points along each
-parameter.
+evaluations may lie nearly on a line. So a search that has found the minimum evaluates three further points along each
+parameter. The slope of each output is the slope of the cubic through them and x. Its error is the distance from the
+slope of the parabola through the first two of them and x: the third one shows what a parabola misses.
 """
+
+import math
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.minimization.running import Running
-from torch_zerohess.search.protocol.white_box import checked_loss
+from torch_zerohess.search.protocol.white_box import WhiteBox, checked_loss
 from torch_zerohess.search.trust_region import TrustRegion
-from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.quadratic import LocalModel
 
 _STEP = 0.05
 """Distance of the points from x, in units of sigma, which is at most the width of the bounds."""
 _MOST = 8
 """Parameters up to which they are evaluated."""
-_CENTER = 1e6
-"""Weight of x among them: the output there is the intercept."""
+_AROUND, _WITHIN = (1.0, -1.0, 0.5), (1.0, 0.5, 1.5)
+"""Places of the points along a parameter, in this distance: around x, or away from a bound that is nearer."""
+_APART = 1e-3
+"""Least distance between two points, in this distance: in a type of few digits they can fall together."""
 
 
 def measure(running: Running) -> None:
@@ -48,18 +54,41 @@ def measured(running: Running, x: Tensor) -> tuple[LocalModel, float] | None:
     if len(outputs) < count or not torch.equal(told[-count:], points) or not bool(torch.isfinite(outputs).all()):
         return None
     step = _STEP * running.search.unit
-    weights = torch.tensor([_CENTER] + (count - 1) * [1.0], dtype=step.dtype, device=step.device)
-    u = (points - x).to(step) / step
-    return fit_outputs(u, outputs.reshape(count, -1).to(step), weights, loss, outputs.shape[1:]), _STEP
+    u = ((points[1:].to(step) - x.to(step)) / step).view(len(_AROUND), len(x), len(x)).diagonal(dim1=1, dim2=2).mT
+    if float(torch.diff(u, dim=1, prepend=u[:, -1:]).abs().min()) < _APART:
+        return None
+    changes = (outputs[1:] - outputs[:1]).reshape(len(_AROUND), len(x), -1).to(step)
+    return _model(u, outputs[0].to(step), changes.transpose(0, 1), loss), _STEP
+
+
+def _model(u: Tensor, output: Tensor, changes: Tensor, loss: WhiteBox) -> LocalModel:
+    """Return the quadratic model of a loss whose output [*out] changes by [n, 3, m] at distances u [n, 3]."""
+    powers = torch.stack([u, u.square(), u**3], 2)
+    jacobian = torch.linalg.solve(powers, changes)[:, 0]
+    missed = jacobian - torch.linalg.solve(powers[:, :2, :2], changes[:, :2])[:, 0]
+    expanded = loss_curvature(loss, output)
+    slope, bend = expanded.slope.flatten(), expanded.products(jacobian.view(len(u), *output.shape))
+    hessian = jacobian @ bend.mT
+
+    def error(directions: Tensor) -> Tensor:
+        """Standard errors [n] of J times directions [*, m]: errors of outputs add up, or are independent."""
+        together, single = (missed * directions).sum(1).abs(), (missed * directions).norm(dim=1)
+        return torch.maximum(together, single).clamp_min(math.ulp(0.0))
+
+    hessian = 0.5 * (hessian + hessian.mT)
+    return LocalModel(expanded.value, jacobian @ slope, hessian, None, error(slope[None]), 2.0 * error(bend))
 
 
 def _surroundings(search: TrustRegion, x: Tensor) -> Tensor | None:
-    """Return x [n] and two points beside it along each parameter, within the bounds: [2 n + 1, n].
+    """Return x [n] and three points beside it along each parameter, within the bounds: [3 n + 1, n].
 
     None for another search than a Gaussian process of outputs, or one of more than 8 parameters.
     """
     if search.loss is None or search.engine != "gaussian_process" or len(x) > _MOST:
         return None
-    step = torch.diag(_STEP * search.unit)
-    beside = x.to(step) + torch.cat([torch.zeros_like(step[:1]), step, -step])
-    return beside.clamp(*search.bounds).to(x)
+    step, (lower, upper) = _STEP * search.unit, search.bounds
+    around, within = (torch.tensor(one, dtype=step.dtype, device=step.device)[:, None] for one in (_AROUND, _WITHIN))
+    below, above = x.to(step) - lower < step, upper - x.to(step) < step
+    u = torch.where(above, -within, torch.where(below, within, around))
+    beside = x.to(step) + torch.cat([torch.zeros_like(step[None]), torch.diag_embed(u * step).flatten(0, 1)])
+    return beside.clamp(lower, upper).to(x)

@@ -51,6 +51,9 @@ def test_of_a_decay_it_is_the_inverse_of_the_hessian(outputs, bounds) -> None:
     truth = torch.linalg.inv(torch.func.hessian(lambda x: loss(decay(x[None])[0]))(fit.x))
     found = fit.covariance()
     torch.testing.assert_close(found, truth, rtol=0.06, atol=0)
+    if fit.engine == "gaussian_process" and outputs:  # second derivatives of the output are left out
+        J = torch.func.jacrev(lambda x: decay(x[None])[0])(fit.x) / SPREAD
+        truth = torch.linalg.inv(J.mT @ J)
     share = fit.standard_errors["hessian_diagonal"] * found.diagonal()
     error = (found - truth).diagonal().abs() / truth.diagonal()
     assert bool((error < 3 * share + 5e-3).all())
@@ -150,14 +153,13 @@ def two_decays(x):
 
 
 def test_a_search_from_x_with_a_small_sigma_knows_a_nearly_singular_hessian() -> None:
-    """The first search has an error of the Hessian that hides its smallest eigenvalue."""
-    start = torch.tensor([1.0, 1.0, 0.7, 2.0]).double()
-    data = two_decays(start[None])[0] + 1e-3 * normal(30)
-    loss = lambda y: 0.5 * ((y - data) / 1e-3).square().sum()  # noqa: E731
-    settings = {"loss": loss, "bounds": (0, 5), "restarts": 0, "seed": 0}
+    """The first search has an error of the Hessian that hides its smallest eigenvalue: its condition is 2e8."""
+    start = torch.tensor([1.0, 1.0, 1.0, 1.2]).double()
+    data = two_decays(start[None])[0] + 1e-5 * normal(30)
+    settings = {"loss": lambda y: 0.5 * ((y - data) / 1e-5).square().sum(), "bounds": (0, 5), "restarts": 0, "seed": 0}
     fit = zh.minimize(two_decays, start + 0.05, sigma=0.1, **settings)
     with pytest.raises(ValueError, match="search again from x with loss=, bounds, restarts=0 and a smaller sigma"):
         fit.covariance()
-    again = zh.minimize(two_decays, fit.x, sigma=1e-4, **settings)
-    truth = torch.linalg.inv(torch.func.hessian(lambda x: loss(two_decays(x[None])[0]))(again.x))
-    torch.testing.assert_close(again.covariance(), truth, rtol=0.02, atol=0)
+    again = zh.minimize(two_decays, fit.x, sigma=1e-2, **settings)
+    J = torch.func.jacrev(lambda x: two_decays(x[None])[0])(again.x) / 1e-5
+    torch.testing.assert_close(again.covariance(), torch.linalg.inv(J.mT @ J), rtol=1e-4, atol=0)

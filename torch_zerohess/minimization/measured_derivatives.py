@@ -55,7 +55,7 @@ def measured(running: Running, x: Tensor) -> tuple[LocalModel, float] | None:
         return None
     step = _STEP * running.search.unit
     u = ((points[1:].to(step) - x.to(step)) / step).view(len(_AROUND), len(x), len(x)).diagonal(dim1=1, dim2=2).mT
-    if float(torch.diff(u, dim=1, prepend=u[:, -1:]).abs().min()) < _APART:
+    if float(torch.cat([torch.zeros_like(u[:, :1]), u], 1).sort(1).values.diff(dim=1).min()) < _APART:
         return None
     changes = (outputs[1:] - outputs[:1]).reshape(len(_AROUND), len(x), -1).to(step)
     return _model(u, outputs[0].to(step), changes.transpose(0, 1), loss), _STEP

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import control_variate, opaque, tracing, transforms
+from torch_zerohess.autograd.captured import warn_of_captured
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.expanded import general, tangent
 from torch_zerohess.autograd.layer import Layer
@@ -36,7 +37,8 @@ class BlackBox(Layer):
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], scalar values (a loss) or tensors (an image). It may use NumPy,
             Mitsuba, another program; it gets detached, contiguous tensors and is not differentiated. A module given as
-            fn is not registered: its parameters are not trained through this layer.
+            fn is not registered: its parameters are not trained through this layer. Other tensors that fn captures
+            have no derivatives, either: UserWarning if they are differentiated.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample,
             and head must not change it. Parameters and other tensors in it are constants: they must not require grad,
@@ -105,6 +107,7 @@ class BlackBox(Layer):
         self.smoothing = smoothing
         check_memory(memory)
         self.call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
+        warn_of_captured(fn, head)
         self.memory = memory
         self.control: Control | None = None
         """The memory during the present call."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
+from torch_zerohess.autograd.captured import warn_of_captured
 from torch_zerohess.autograd.layer import Layer
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.call import BlackBoxCall
@@ -86,6 +87,7 @@ class SparseBlackBox(Layer):
             check_grid(grid)
         self.smoothing = smoothing
         self.call = BlackBoxCall(fn, vectorized, evaluator, on_nonfinite=on_nonfinite)
+        warn_of_captured(fn)
         self.settings: dict[str, Any] = {"keep": keep, "rate": rate, "grid": grid}
         self.jacobians = []
         self._warned = False

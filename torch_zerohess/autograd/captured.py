@@ -1,0 +1,50 @@
+"""A warning about tensors that a black box or its head captures: a layer has derivatives by x alone."""
+
+import dis
+import functools
+import types
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from torch import Tensor
+
+from torch_zerohess.autograd.transforms import derivative_wanted
+from torch_zerohess.wrappers import differentiated
+
+_EMPTY = types.CellType()
+"""Of a variable that has no value yet."""
+
+
+def warn_of_captured(fn: Callable[..., Any], head: Callable[..., Any] | None = None) -> None:
+    """Warn once for each function that takes a tensor, whose derivative is wanted, from around its definition.
+
+    A head that captures a parameter is an error when it is called, but there a transform of `torch.func` is not seen.
+    """
+    for role, function, wanted in (("fn", fn, derivative_wanted), ("head", head, differentiated)):
+        for name, one in _captured(function):
+            if isinstance(one, Tensor) and wanted(one):
+                warnings.warn(
+                    f"{role} captures the tensor {name!r}, which is differentiated, but a layer has derivatives by x "
+                    f"alone: join it to x, or let {role} capture {name}.detach()",
+                    UserWarning,
+                    stacklevel=3,
+                )
+                break
+
+
+def _captured(function: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and values that a function of Python, or a partial one, gets from elsewhere than its arguments."""
+    while isinstance(function, functools.partial):
+        yield from function.keywords.items()
+        yield from ((f"args[{k}]", one) for k, one in enumerate(function.args))
+        function = function.func
+    function = getattr(function, "__func__", function)
+    code = getattr(function, "__code__", None)
+    if code is None:
+        return
+    for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=False):
+        if cell != _EMPTY:
+            yield name, cell.cell_contents
+    loaded = (one.argval for one in dis.get_instructions(code) if one.opname == "LOAD_GLOBAL")
+    yield from ((name, function.__globals__[name]) for name in loaded if name in function.__globals__)

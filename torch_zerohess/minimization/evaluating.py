@@ -21,8 +21,7 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
     Args:
         call: the black box.
         memory: gets every evaluation; or None.
-        scalar: whether each value must be one number. The call raises ValueError for others, and for outputs of another
-            shape than before.
+        scalar: whether each value must be one number. The call raises ValueError for others.
     """
 
     def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
@@ -44,9 +43,12 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
                 f"{len(points)} points"
             )
         if failure is None and before is not None and values.shape[1:] != before.shape[1:]:
-            raise ReturnedValueError(
-                f"fn must return values of one shape, got {list(values.shape[1:])} at the point "
-                f"[{numbers_of(points[0])}] and {list(before.shape[1:])} before"
+            numbers, failure = (
+                [],
+                ReturnedValueError(
+                    f"fn must return values of one shape, got {list(values.shape[1:])} at the point "
+                    f"[{numbers_of(points[0])}] and {list(before.shape[1:])} before"
+                ),
             )
         if memory is not None and numbers:
             with memory.lock:

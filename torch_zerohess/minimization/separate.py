@@ -5,7 +5,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.evaluators.single_nan import alike
 from torch_zerohess.minimization.record import Call
 
@@ -27,9 +26,6 @@ def separated(call: Call, alone: Callable[[int], bool]) -> Call:
         for part in points.split(lengths(points)):
             found, returned, error = call(part)
             *known, returned = alike([*values, returned])
-            if found and known and returned.shape[1:] != known[0].shape[1:]:
-                shapes = f"{list(known[0].shape[1:])} and {list(returned.shape[1:])}"
-                found, error = [], ReturnedValueError(f"fn must return values of one shape in every call, got {shapes}")
             if found:
                 numbers += [first + k for k in found]
                 values = [*known, returned]

@@ -112,7 +112,9 @@ def test_a_call_that_fails_and_one_of_another_shape() -> None:
 
     assert separated(first, lambda count: False)(points)[0] == []
     shapes = iter([4, 5])
-    with pytest.raises(ValueError, match=r"fn must return values of one shape in every call, got \[4\] and \[5\]"):
+    with pytest.raises(
+        ValueError, match=r"fn must return values of one shape, got \[5\] at the point \[1\] and \[4\] bef"
+    ):
         zh.minimize(lambda z: torch.zeros(len(z), next(shapes)), [1.0], sigma=1.0, loss=torch.sum)
 
 

@@ -40,11 +40,10 @@ def _captured(function: Any) -> Iterator[tuple[str, Any]]:
         yield from ((f"args[{k}]", one) for k, one in enumerate(function.args))
         function = function.func
     function = getattr(function, "__func__", function)
-    code = getattr(function, "__code__", None)
-    if code is None:
+    if not isinstance(function, types.FunctionType):
         return
-    for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=False):
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=False):
         if cell != _EMPTY:
             yield name, cell.cell_contents
-    loaded = (one.argval for one in dis.get_instructions(code) if one.opname == "LOAD_GLOBAL")
+    loaded = (one.argval for one in dis.get_instructions(function) if one.opname == "LOAD_GLOBAL")
     yield from ((name, function.__globals__[name]) for name in loaded if name in function.__globals__)

@@ -25,6 +25,15 @@ def of_setting(z):
     return scaled(SETTING, GLOBAL)
 
 
+class Compiled:
+    """A function of a compiler, as of Numba: it keeps the code of what it was made of, and nothing around it."""
+
+    __code__ = of_global.__code__
+
+    def __call__(self, z):
+        return z.sum(1)
+
+
 class Model:
     weight = torch.ones(1, requires_grad=True)
 
@@ -62,7 +71,7 @@ def test_a_tensor_that_requires_grad_is_a_warning(fn, name, layer):
 
 
 @pytest.mark.parametrize(
-    "fn", [closed(torch.ones(1)), of_setting, Model().of_attribute, torch.nn.Linear(1, 1), torch.sum], ids=str
+    "fn", [closed(torch.ones(1)), of_setting, Model().of_attribute, torch.nn.Linear(1, 1), torch.sum, Compiled()]
 )
 def test_other_functions_are_none(fn):
     zh.BlackBox(fn, SMOOTHING)

@@ -25,12 +25,6 @@ LOCAL: dict[str, dict[str, Any]] = {
 """Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
 NETWORKS: dict[str, dict[str, Any]] = {
-    # By hand on runs 200 to 202 with 400 renders: 1 000 or 2 000 steps of memory_newton, 400 or 2 000 of memory_adam.
-    "cnn_wide": {
-        "memory_newton": {"least_steps": 2000},
-        "memory_adam": {"least_steps": 2000},
-        "memory_pairs": {"newton": {"least_steps": 2000}},
-    },
     # By hand: the radius on runs 100 to 102 with 1 000 simulations, beside the default; the learning rate on runs 1000
     # to 1003 with 60 to 300 simulations; 400 or 1 200 steps with 150 simulations, on runs 100 to 107 of memory_adam and
     # on runs 100 to 102 of memory_newton and memory_targets.

@@ -94,7 +94,7 @@ def minimize(
             kinks, as a sum of magnitudes or a norm. A point with a number that is not finite in its output has failed,
             also where the loss ignores that number. Leave constants out: "gaussian_process" takes fewer evaluations
             where the loss falls to 0. Without noise, and up to 8 parameters, "gaussian_process" ends with x and three
-            points beside it along each parameter, up to 0.05 sigma away: `gradient` and `hessian` are from them. Where
+            points beside it along each parameter, up to 0.075 sigma away: `gradient` and `hessian` are from them. Where
             too few evaluations are left for them, these are from the model of the search.
         bounds: (lower, upper), numbers or [n] or None; n pairs (lower, upper), a list of tuples or an array [n, 2]; or
             `scipy.optimize.Bounds`. ValueError for two rows of two numbers that can be read either way.

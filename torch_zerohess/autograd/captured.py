@@ -17,9 +17,10 @@ _EMPTY = types.CellType()
 
 
 def warn_of_captured(fn: Callable[..., Any], head: Callable[..., Any] | None = None) -> None:
-    """Warn once for each function that takes a tensor, whose derivative is wanted, from around its definition.
+    """Warn if fn or head uses a tensor that is no argument, and whose derivative is wanted. Each warns once at most.
 
-    A head that captures a parameter is an error when it is called, but there a transform of `torch.func` is not seen.
+    A head that captures a parameter of a model is an error when the head is called. A tensor that `torch.func`
+    differentiates cannot be told from others there, so the warning is about these.
     """
     for role, function, wanted in (("fn", fn, derivative_wanted), ("head", head, differentiated)):
         for name, one in _captured(function):

@@ -45,6 +45,7 @@ def _as_array(result: Any) -> Any:
     numpy: Any = sys.modules.get("numpy")
     if numpy is None or isinstance(result, (Tensor, numpy.ndarray, numpy.generic)):
         return result
+    # Arrays of JAX have both: torch takes them where they are.
     on_host = hasattr(result, "__array__") and not hasattr(result, "__dlpack__")
     return numpy.asarray(result) if on_host or hasattr(result, "__array_interface__") else result
 

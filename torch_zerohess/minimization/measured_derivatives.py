@@ -22,9 +22,9 @@ _STEP = 0.05
 _MOST = 8
 """Parameters up to which they are evaluated."""
 _AROUND, _WITHIN = (1.0, -1.0, 0.5), (1.0, 0.5, 1.5)
-"""Places of the points along a parameter, in this distance: around x, or away from a bound that is nearer."""
+"""Places of the points along a parameter, in units of the distance: around x, or away from a bound that is nearer."""
 _APART = 1e-3
-"""Least distance between two points, in this distance: in a type of few digits they can fall together."""
+"""Least distance between two points along a parameter, in the same units. In float32 they can fall together."""
 
 
 def measure(running: Running) -> None:
@@ -44,7 +44,7 @@ def measure(running: Running) -> None:
 def measured(running: Running, x: Tensor) -> tuple[LocalModel, float] | None:
     """Return a quadratic around x [n] and its width in units of sigma; None if `measure` has not seen x last.
 
-    It is also None if an output around x is not finite.
+    It is also None if an output around x is not finite, or if points fall together.
     """
     points, loss = _surroundings(running.search, x), checked_loss(running.search.loss)
     if points is None or loss is None:
@@ -54,6 +54,7 @@ def measured(running: Running, x: Tensor) -> tuple[LocalModel, float] | None:
     if len(outputs) < count or not torch.equal(told[-count:], points) or not bool(torch.isfinite(outputs).all()):
         return None
     step = _STEP * running.search.unit
+    # A point differs from x in one parameter: [n, 3] of its distances.
     u = ((points[1:].to(step) - x.to(step)) / step).view(len(_AROUND), len(x), len(x)).diagonal(dim1=1, dim2=2).mT
     if float(torch.cat([torch.zeros_like(u[:, :1]), u], 1).sort(1).values.diff(dim=1).min()) < _APART:
         return None

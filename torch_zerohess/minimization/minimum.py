@@ -58,9 +58,10 @@ class Minimum:
             output and the Hessian H of the loss: second derivatives of the output are left out.
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
             infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
-            too small: they include neither third derivatives nor what J^T H J leaves out. At an active bound few
-            evaluations lie beside x, and the Hessian may be wrong by far more than its error. In noise, and up to 40
-            parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
+            too small: they do not include what J^T H J leaves out. They include third derivatives only where a search
+            by "gaussian_process" with `loss` has ended by itself. At an active bound few evaluations lie beside x, and
+            the Hessian may be wrong by far more than its error. In noise, and up to 40 parameters, about 95 % of
+            derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
             minimum is a sharp tip that few evaluations resolve. With more parameters, or with fewer than (n + 1)(n +
             2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.
         sigma: [n], width of the quadratic along every parameter; in noise, the mean distance from x of the evaluations

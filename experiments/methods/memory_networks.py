@@ -3,11 +3,11 @@
 The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for few images
 of a batch. With up to 10 parameters the loss is the local entropy, which leaves plateaus where the mean does not. With
 more parameters a few draws never hit a valley, and the loss is the mean. This is what a user would write: everything
-comes from the public names of the library. All tasks have the same settings, the defaults below, but for CNN-THROW (see
-`settings/ours.py`). They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on runs 100
-to 107 of CNN-THROW; `least_steps` on runs 100 to 107 of CNN with 100 renders. The weights in the coefficient of
-`zh.Memory` were chosen on runs 14, 16 and 17 of CNN with 1 200 renders, `output_radius` on runs 17, 33 and 36, and
-`warm_up` on run 8 of CNN-TEXTURE. No table reports one of these runs.
+comes from the public names of the library. All tasks have the same settings, the defaults below, but for CNN wide and
+CNN-THROW (see `settings/ours.py`). They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE,
+and on runs 100 to 107 of CNN-THROW; `least_steps` on runs 100 to 107 of CNN with 100 renders. The weights in the
+coefficient of `zh.Memory` were chosen on runs 14, 16 and 17 of CNN with 1 200 renders, `output_radius` on runs 17, 33
+and 36, and `warm_up` on run 8 of CNN-TEXTURE. No table reports one of these runs.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the

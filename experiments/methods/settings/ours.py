@@ -25,6 +25,13 @@ LOCAL: dict[str, dict[str, Any]] = {
 """Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
 NETWORKS: dict[str, dict[str, Any]] = {
+    # As many steps as 4 000 renders give. With 400 renders no network stayed on a plateau on runs 200 to 211. With
+    # 2 000 steps run 61 did, after runs 200 to 202 had not: runs 60 to 64 with 400 renders count as tuning.
+    "cnn_wide": {
+        "memory_newton": {"least_steps": 984},
+        "memory_adam": {"least_steps": 984},
+        "memory_pairs": {"newton": {"least_steps": 984}},
+    },
     # By hand: the radius on runs 100 to 102 with 1 000 simulations, beside the default; the learning rate on runs 1000
     # to 1003 with 60 to 300 simulations; 400 or 1 200 steps with 150 simulations, on runs 100 to 107 of memory_adam and
     # on runs 100 to 102 of memory_newton and memory_targets.

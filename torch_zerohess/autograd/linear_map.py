@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torch_zerohess.autograd import transforms
 from torch_zerohess.sampling import kernels
+from torch_zerohess.sampling.batching import over_vectors
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 
 
@@ -81,25 +82,8 @@ class _LinearMap(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], vectors: Tensor, transposed: bool, zero: bool, *parts: Any) -> Any:
-        """Fold a mapped dimension into M where the samples are shared, else into B."""
-        batched = any(dim is not None for dim in in_dims[3:])
-        if in_dims[0] is None:
-            vectors = vectors.expand(info.batch_size, *vectors.shape)
-        else:
-            vectors = vectors.movedim(in_dims[0], 0)
-        V, B, M = vectors.shape[:3]
-        if not batched:
-            folded = vectors.movedim(0, 1).reshape(B, V * M, -1)
-            result = _LinearMap.apply(folded, transposed, zero, *parts)
-            return result.reshape(B, V, M, -1), 1
-        parts = tuple(_fold(part, dim, V) for part, dim in zip(parts, in_dims[3:], strict=True))
-        result = _LinearMap.apply(vectors.reshape(V * B, M, -1), transposed, zero, *parts)
-        return result.reshape(V, B, M, -1), 0
+        def linear(vectors: Tensor, *parts: Any) -> Tensor:
+            result: Tensor = _LinearMap.apply(vectors, transposed, zero, *parts)
+            return result
 
-
-def _fold(part: Any, dim: int | None, V: int) -> Any:
-    """Fold the mapped dimension of a batch-first tensor into its batch; sigma [n] is shared by all and has none."""
-    if not isinstance(part, Tensor) or (dim is None and part.dim() == 1):
-        return part
-    part = part.expand(V, *part.shape) if dim is None else part.movedim(dim, 0)
-    return part.flatten(0, 1)
+        return over_vectors(linear, info.batch_size, vectors, parts, (in_dims[0], *in_dims[3:]))

@@ -255,6 +255,8 @@ def test_a_linearized_layer_is_one_linear_function(
         before = len(calls)
         layer.smoothing = layer.smoothing.replace(sigma=2.0)
         torch.testing.assert_close(linear(2.0 * direction), 2.0 * product)
+        mapped = torch.func.vmap(linear)(torch.stack([direction, -direction]))
+        torch.testing.assert_close(mapped, torch.stack([product, -product]))
         layer.smoothing = layer.smoothing.replace(sigma=S.sigma)
         assert len(calls) == before
 

@@ -13,12 +13,12 @@ V, B, S, M, N = 3, 2, 5, 4, 6
 def _samples(redrawn: bool, count: int) -> tuple[list[torch.Tensor], list[int | None]]:
     """Return samples, or what they are drawn from, of `count` elements, and the mapped dimensions."""
     sigma = torch.rand(N, dtype=torch.float64) + 0.5
-    x = torch.randn(count, B, N, dtype=torch.float64)
-    drawn = [kernels.sample(7 + k, S, x[k], sigma, True, proposals.GAUSSIAN, False, True) for k in range(count)]
-    mapped = 0 if count > 1 else None
-    rows, u = (torch.stack([one[k] for one in drawn]) for k in (0, 2))
+    x = torch.randn(B, count, N, dtype=torch.float64)
+    drawn = [kernels.sample(7 + k, S, x[:, k], sigma, True, proposals.GAUSSIAN, False, True) for k in range(count)]
+    mapped = 1 if count > 1 else None
+    rows, u = (torch.stack([one[k] for one in drawn], 1) for k in (0, 2))
     samples = [rows, x] if redrawn else [u]
-    samples = samples if count > 1 else [one[0] for one in samples]
+    samples = samples if count > 1 else [one[:, 0] for one in samples]
     return ([*samples, sigma], [mapped, mapped, None]) if redrawn else (samples, [mapped])
 
 
@@ -36,5 +36,5 @@ def test_all_elements_are_mapped_by_one_call(mapped: str, function, redrawn: boo
 
     result = torch.vmap(each, (dim, *dims))(vectors, *samples)  # a warning would fail the test
     for k in range(V):
-        one = [part if d is None else part[k] for part, d in zip(samples, dims, strict=True)]
+        one = [part if d is None else part[:, k] for part, d in zip(samples, dims, strict=True)]
         torch.testing.assert_close(result[k], each(vectors if dim is None else vectors[:, k], *one))

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torch_zerohess.autograd import linear_map
 from torch_zerohess.sampling import kernels, proposals
 from torch_zerohess.sampling.kernels import Redrawn
 
@@ -23,12 +24,14 @@ def _samples(redrawn: bool, count: int) -> tuple[list[torch.Tensor], list[int | 
 
 
 @pytest.mark.parametrize("redrawn", [False, True])
-@pytest.mark.parametrize("function", [kernels.project, kernels.accumulate, kernels.accumulate_squares])
+@pytest.mark.parametrize(
+    "function", [linear_map.project, kernels.project, kernels.accumulate, kernels.accumulate_squares]
+)
 @pytest.mark.parametrize("mapped", ["vectors", "samples", "both"])
 def test_all_elements_are_mapped_by_one_call(mapped: str, function, redrawn: bool) -> None:
     samples, dims = _samples(redrawn, V if mapped != "vectors" else 1)
     dim = 1 if mapped != "samples" else None
-    width = N if function is kernels.project else 2 * S
+    width = N if function in (linear_map.project, kernels.project) else 2 * S
     vectors = torch.randn(*((B, M, width) if dim is None else (B, V, M, width)), dtype=torch.float64)
 
     def each(vectors: torch.Tensor, *samples: torch.Tensor) -> torch.Tensor:

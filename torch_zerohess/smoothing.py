@@ -60,10 +60,10 @@ class Smoothing:
             by orders of magnitude, and not the expectation. With sampler "sobol" the draws are scrambles, and samples
             must be even for "mean".
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
-            normal directions, n in each. The last block is cut if n does not divide the number of perturbations. A cut
-            block is less exact: 5.2 n perturbations may leave a larger error than 5 n. Proposals "uniform" and "fr22"
-            get the quantiles of their own distribution that belong to these directions. Lobes of the other proposals
-            are drawn independently.
+            normal directions, n in each. From 2 n perturbations on, the last block also has what n leaves over: up to
+            2 n - 1 directions that cover all parameters evenly. With fewer perturbations blocks have less than n.
+            Proposals "uniform" and "fr22" get the quantiles of their own distribution that belong to these directions.
+            Lobes of the other proposals are drawn independently.
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
             perturbations: every call uses the same ones, whatever the number of threads. With a `Memory`, and with an
             earlier `SparseJacobian`, they also depend on the number of evaluations that it has taken. Layers in

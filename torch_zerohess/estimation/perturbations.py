@@ -101,7 +101,7 @@ def stored(smoothing: Smoothing, B: int, n: int) -> bool:
 def draws(smoothing: Smoothing, n: int) -> list[Tensor]:
     """Return which of the K rows belong to each independent draw: int64 [D, r], draws of the same size together."""
     index = torch.arange(smoothing.samples * smoothing.groups(n), device="cpu")
-    size = samplers.draw_size(smoothing, n)
-    whole = len(index) // size * size
-    parts = [index[:whole].view(-1, size)] + ([index[None, whole:]] if whole < len(index) else [])
+    whole = len(index) - samplers.last_draw(smoothing, n)
+    parts = [index[:whole].view(-1, samplers.draw_size(smoothing, n))]
+    parts += [index[None, whole:]] if whole < len(index) else []
     return [torch.cat([part, part + len(index)], 1) for part in parts] if smoothing.antithetic else parts

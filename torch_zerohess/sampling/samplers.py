@@ -5,6 +5,8 @@ other. Rows that depend on each other form one independent draw of `draw_size` c
 "optimal" the set of samples of each element is an estimate of its own.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -21,7 +23,7 @@ _SHIFTS, _JITTER = 1 << 40, 1 << 41  # rows of noise that no perturbation uses
 
 
 def draw_size(smoothing: Smoothing, n: int) -> int:
-    """Return how many consecutive samples make one independent draw; the last draw of an estimate may have fewer."""
+    """Return how many consecutive samples make one independent draw; see `last_draw` for the last one."""
     samples = smoothing.samples
     if smoothing.sampler == "random":
         return 1
@@ -33,6 +35,16 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
         return next(size for size in range(max(1, min(n, samples // 2)), 0, -1) if samples % size == 0)
     # Two blocks have a standard error; with a mean of the others it takes three.
     return min(n, max(1, samples // 3) if smoothing.baseline == "mean" else (samples + 1) // 2)
+
+
+def last_draw(smoothing: Smoothing, n: int) -> int:
+    """Return how many samples the last draw of an estimate has, and 0 if all draws have `draw_size`.
+
+    What n orthogonal directions leave over makes the last block longer, not another block, unless it is the only one.
+    """
+    size = draw_size(smoothing, n)
+    blocks, rest = divmod(smoothing.samples, size)
+    return n + rest if rest and size == n and blocks > 1 else rest
 
 
 def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
@@ -82,17 +94,20 @@ def _directions(rows: Tensor, n: int, smoothing: Smoothing) -> Tensor:
     """Return normal directions [R, n], in sets of `smoothing.samples` rows that consist of orthogonal blocks.
 
     The orthonormal factor of a Gaussian matrix is independent of the lengths of its rows. So each direction is scaled
-    by the length of its own row, and every row is N(0, I).
+    by the length of its own row, and every row is N(0, I). A last block of more than n rows has the directions v of a
+    tight frame, which such a factor rotates: as for n orthogonal ones, the mean of v v^T is I / n.
     """
     plain = rows.clone()
     plain[:, 2], plain[:, 3:] = NORMAL, 0
     gaussian = kernels.draw(plain, n).view(-1, smoothing.samples, n)
-    size = draw_size(smoothing, n)
-    whole = smoothing.samples // size * size
-    blocks = [_orthogonalized(gaussian[:, :whole].reshape(-1, size, n)).view(-1, whole, n)]
-    if whole < smoothing.samples:
-        blocks.append(_orthogonalized(gaussian[:, whole:]))
-    return torch.cat(blocks, 1).flatten(0, 1)
+    size, last = draw_size(smoothing, n), last_draw(smoothing, n)
+    whole = smoothing.samples - last
+    directions = [_orthonormal(gaussian[:, :whole].reshape(-1, size, n)).view(-1, whole, n)]
+    if last:
+        basis = _orthonormal(gaussian[:, whole : whole + n])
+        directions.append(_rotated(_tight_frame(last, n, basis.device), basis) if last > n else basis)
+    lengths = torch.linalg.vector_norm(gaussian, dim=2, keepdim=True)
+    return (torch.cat(directions, 1) * lengths).flatten(0, 1)
 
 
 def _lobes_in(u: Tensor, rows: Tensor) -> Tensor:
@@ -101,7 +116,7 @@ def _lobes_in(u: Tensor, rows: Tensor) -> Tensor:
     return with_lobes(rows, u, p[:, 0], p[:, 1])
 
 
-def _orthogonalized(block: Tensor) -> Tensor:
+def _orthonormal(block: Tensor) -> Tensor:
     """Gram-Schmidt, twice, on the rows of [B, c, n]; unlike QR its bits do not follow the number of threads."""
     basis = torch.empty_like(block)
     for row in range(block.shape[1]):
@@ -110,7 +125,27 @@ def _orthogonalized(block: Tensor) -> Tensor:
             known = basis[:, :row].contiguous()
             v = v - kernels.accumulate(known, kernels.project(known, v))
         basis[:, row : row + 1] = v / torch.linalg.vector_norm(v, dim=2, keepdim=True)
-    return basis * torch.linalg.vector_norm(block, dim=2, keepdim=True)
+    return basis
+
+
+def _tight_frame(count: int, n: int, device: torch.device) -> Tensor:
+    """Return unit vectors v [count, n] whose mean of v v^T is I / n, for n < count < 2 n.
+
+    Rows of a real Fourier matrix with n of its columns (Goyal, Kovacevic and Kelner 2001). Their sum is 0 if n or
+    count is even.
+    """
+    j = torch.arange(count, device=device)
+    angle = (2.0 * math.pi / count) * (j[:, None] * torch.arange(1, n // 2 + 1, device=device) % count).double()
+    columns = [2.0**0.5 * angle.cos(), 2.0**0.5 * angle.sin()]
+    if n % 2:
+        columns.append((1.0 - 2.0 * (j % 2) if count % 2 == 0 else torch.ones_like(j)).double()[:, None])
+    return torch.cat(columns, 1) / n**0.5
+
+
+def _rotated(frame: Tensor, basis: Tensor) -> Tensor:
+    """Return vectors [count, n] in bases [B, n, n], a few at a time, so that no bit follows the number of threads."""
+    parts = frame.expand(len(basis), -1, -1).split(kernels.MANY_VECTORS, 1)
+    return torch.cat([kernels.accumulate(basis, part) for part in parts], 1)
 
 
 def random(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:

@@ -110,7 +110,9 @@ def test_the_first_order_draws_no_lobes_of_the_second() -> None:
 
 
 @pytest.mark.parametrize("antithetic", [True, False])
-@pytest.mark.parametrize(("samples", "sampler"), [(7, "random"), (32, "sobol"), (7, "orthogonal"), (5, "orthogonal")])
+@pytest.mark.parametrize(
+    ("samples", "sampler"), [(7, "random"), (32, "sobol"), (7, "orthogonal"), (5, "orthogonal"), (19, "orthogonal")]
+)
 def test_every_row_belongs_to_one_independent_draw(samples: int, sampler: str, antithetic: bool) -> None:
     smoothing = S.replace(samples=samples, sampler=sampler, antithetic=antithetic)
     parts = draws(smoothing, N)

@@ -65,8 +65,8 @@ PLAIN = Smoothing(sigma=1.0, samples=16)
 @pytest.mark.parametrize("baseline", ["center", "mean", "none"])
 @pytest.mark.parametrize("sampler", ["random", "sobol", "orthogonal"])
 def test_intervals_of_aggregate_contain_the_truth(sampler: str, baseline: str, antithetic: bool) -> None:
-    """16 random draws; 4 scrambles of 8 points; 8 blocks of 2 directions."""
-    samples = 32 if sampler == "sobol" else 16
+    """16 random draws; 4 scrambles of 8 points; 7 blocks of 2 directions and one of 3."""
+    samples = {"random": 16, "sobol": 32, "orthogonal": 17}[sampler]
     smoothing = PLAIN.replace(samples=samples, sampler=sampler, baseline=baseline, antithetic=antithetic)
     check(smoothing, seeds=4 if sampler == "sobol" else 1)  # a batch shares its scrambles
 

@@ -72,10 +72,58 @@ def test_the_rows_left_over_are_orthogonal_too() -> None:
 def test_orthogonal_rows_stay_orthogonal_where_the_gaussian_ones_are_nearly_parallel() -> None:
     """The second pass of Gram-Schmidt: after one, rounding is multiplied by the condition of the block."""
     block = 3.0 + 1e-9 * spread(15, -1.0, 1.0).view(1, 3, 5)
-    q = samplers._orthogonalized(block)
-    unit = q / q.norm(dim=2, keepdim=True)
+    unit = samplers._orthonormal(block)
     assert float((unit @ unit.mT - torch.eye(3)).abs().max()) < 1e-14
-    torch.testing.assert_close(q.norm(dim=2), block.norm(dim=2))
+
+
+LEFT_OVER = [(2, 5), (3, 8), (4, 11), (5, 13), (6, 17)]
+"""Parameters, and a number of samples that leaves directions over: n or their number even, or both odd."""
+
+
+@pytest.mark.parametrize(
+    ("samples", "n", "last"), [(12, 3, 0), (13, 3, 4), (14, 3, 5), (7, 4, 3), (3, 2, 1), (1, 2, 0)]
+)
+def test_the_last_draw_has_what_is_left_over_unless_it_would_be_the_only_one(samples: int, n: int, last: int) -> None:
+    assert samplers.last_draw(Smoothing(sigma=1.0, samples=samples, sampler="orthogonal"), n) == last
+
+
+@pytest.mark.parametrize(("n", "samples"), LEFT_OVER)
+def test_directions_of_the_last_block_cover_all_parameters_evenly(n: int, samples: int) -> None:
+    block = drawn("orthogonal", 50, n, samples)[:, -(n + samples % n) :]
+    v = block / block.norm(dim=2, keepdim=True)
+    torch.testing.assert_close(v.mT @ v, (block.shape[1] / n * torch.eye(n)).expand(50, n, n).double())
+    if n % 2 == 0 or block.shape[1] % 2 == 0:
+        torch.testing.assert_close(v.sum(1), torch.zeros(50, n, dtype=torch.float64))
+    assert len(torch.unique((v[:, 0] * 1e6).round(), dim=0)) == 50  # every element of a batch has a rotation of its own
+
+
+@pytest.mark.parametrize(("n", "samples"), LEFT_OVER)
+def test_every_sample_of_the_last_block_is_normal_and_independent_of_other_blocks(n: int, samples: int) -> None:
+    """Moments of second and fourth order over a batch: 5 standard errors."""
+    count = 40_000
+    u = drawn("orthogonal", count, n, samples)
+    for row in (-1, -2, -n - 1):
+        products = u[:, row, :, None] * u[:, row, None, :]
+        deviation = (products.mean(0) - torch.eye(n)) / (torch.eye(n) + 1.0).sqrt() * count**0.5
+        assert float(deviation.abs().max()) < 5.0
+        fourth = u[:, row].square().sum(1).square()  # n (n + 2), with variance 8 n (n + 2) (n + 3)
+        assert abs(float(fourth.mean()) - n * (n + 2)) < 5.0 * (8 * n * (n + 2) * (n + 3) / count) ** 0.5
+    cosines = torch.nn.functional.cosine_similarity(u[:, 0], u[:, -1], dim=1).square()
+    assert abs(float(cosines.mean()) - 1 / n) < 5.0 * (2 * (n - 1) / (n**2 * (n + 2)) / count) ** 0.5
+
+
+@pytest.mark.parametrize(("n", "samples"), [*LEFT_OVER, (3, 9)])
+def test_the_error_of_a_slope_falls_with_the_square_root_of_samples_whether_n_divides_them_or_not(
+    n: int, samples: int
+) -> None:
+    """f(x) = a x: only the lengths are random. The mean of |g - a|^2 / |a|^2 is 2 / samples.
+
+    Where n divides samples this is known; cut blocks would have errors of the order of their share.
+    """
+    a, count = spread(n, -1.0, 2.0), 20_000
+    u = drawn("orthogonal", count, n, samples)
+    errors = ((u * (u @ a)[..., None]).mean(1) - a).square().sum(1) / a.square().sum()
+    assert abs(float(errors.mean()) * samples / 2 - 1.0) < 5.0 * float(errors.std()) / count**0.5 * samples / 2
 
 
 def test_sobol_points_of_a_batch_and_of_its_scrambles_differ() -> None:

@@ -60,8 +60,8 @@ class Smoothing:
             by orders of magnitude, and not the expectation. With sampler "sobol" the draws are scrambles, and samples
             must be even for "mean".
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
-            normal directions, n in each. From 2 n perturbations on, the last block also has what n leaves over: up to
-            2 n - 1 directions that cover all parameters evenly. With fewer perturbations blocks have less than n.
+            normal directions, n in each, or fewer where this would not make two blocks (three for baseline "mean").
+            What is left over makes the last block longer: more than n directions cover all parameters evenly, too.
             Proposals "uniform" and "fr22" get the quantiles of their own distribution that belong to these directions.
             Lobes of the other proposals are drawn independently.
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the

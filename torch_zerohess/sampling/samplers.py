@@ -40,11 +40,11 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
 def last_draw(smoothing: Smoothing, n: int) -> int:
     """Return how many samples the last draw of an estimate has, and 0 if all draws have `draw_size`.
 
-    What n orthogonal directions leave over makes the last block longer, not another block, unless it is the only one.
+    What blocks of orthogonal directions leave over makes the last one longer, unless there is only one.
     """
     size = draw_size(smoothing, n)
     blocks, rest = divmod(smoothing.samples, size)
-    return n + rest if rest and size == n and blocks > 1 else rest
+    return size + rest if rest and blocks > 1 else rest
 
 
 def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:

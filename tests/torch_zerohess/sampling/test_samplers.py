@@ -81,10 +81,22 @@ LEFT_OVER = [(2, 5), (3, 8), (4, 11), (5, 13), (6, 17)]
 
 
 @pytest.mark.parametrize(
-    ("samples", "n", "last"), [(12, 3, 0), (13, 3, 4), (14, 3, 5), (7, 4, 3), (3, 2, 1), (1, 2, 0)]
+    ("samples", "n", "baseline", "last"),
+    [
+        (12, 3, "center", 0),
+        (13, 3, "center", 4),
+        (14, 3, "center", 5),
+        (7, 4, "center", 3),  # after a block of four
+        (1, 4, "center", 0),
+        (7, 4, "mean", 3),  # after two blocks of two
+        (11, 4, "mean", 5),  # after two blocks of three
+    ],
 )
-def test_the_last_draw_has_what_is_left_over_unless_it_would_be_the_only_one(samples: int, n: int, last: int) -> None:
-    assert samplers.last_draw(Smoothing(sigma=1.0, samples=samples, sampler="orthogonal"), n) == last
+def test_the_last_draw_has_what_is_left_over_unless_it_would_be_the_only_one(
+    samples: int, n: int, baseline: str, last: int
+) -> None:
+    smoothing = Smoothing(sigma=1.0, samples=samples, sampler="orthogonal", baseline=baseline)
+    assert samplers.last_draw(smoothing, n) == last
 
 
 @pytest.mark.parametrize(("n", "samples"), LEFT_OVER)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from layers import AGGREGATE, BATCH, BOTH, EVERY, IMAGE, SCALAR, N, V, X, close, leaf, network
+from layers import AGGREGATE, BATCH, BOTH, EVERY, IMAGE, SCALAR, SETTINGS, N, V, X, close, leaf, network
 from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 
@@ -244,8 +244,11 @@ def test_forward_mode(smoothing: Smoothing) -> None:
 
 
 @BOTH
-@EVERY
-def test_frozen_samples_pass_gradcheck_in_every_mode(smoothing: Smoothing) -> None:
+@pytest.mark.parametrize(
+    ("memory", "name"), [*(("stored", name) for name in SETTINGS), ("redrawn", "sobol")], indirect=["memory"]
+)
+def test_frozen_samples_pass_gradcheck_in_every_mode(name: str) -> None:
+    smoothing = SETTINGS[name]
     frozen, e = BlackBox(IMAGE.f, smoothing).freeze(BATCH[:2]), estimate(IMAGE.f, BATCH[:2], smoothing)
     at = leaf(BATCH[:2])
     close(frozen(at).detach(), e.value)

@@ -4,6 +4,8 @@ The samples are many and quasi-random, so that their error is far below the tole
 relative to the largest element; the structure (symmetry, agreement of matrix-free and dense) holds to rounding.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import torch
@@ -40,6 +42,15 @@ def flat_call(net: nn.Module, theta: torch.Tensor, inputs: torch.Tensor) -> torc
     return functional_call(net, named, (inputs,))
 
 
+class Case(NamedTuple):
+    """A loss behind two white boxes and a black one, its parameters, and by mode its curvature: true and found."""
+
+    loss: torch.Tensor
+    parameters: list[nn.Parameter]
+    truth: dict[str, torch.Tensor]
+    dense: dict[str, torch.Tensor]
+
+
 @pytest.fixture(scope="module", params=TRUTHS)
 def case(request):
     truth, net = TRUTHS[request.param], network()
@@ -51,21 +62,20 @@ def case(request):
     jacobian = torch.func.jacrev(lambda t: flat_call(net, t, inputs).flatten())(theta)
     layer = zh.BlackBox(truth.f, zh.Smoothing(sigma=SIGMA, samples=1 << 14, sampler="sobol", seed=0), value="smoothed")
     loss = layer(net(inputs)).square().mean()  # white box, black box, white box
-    return loss, list(net.parameters()), {"exact": hessian, "gauss_newton": jacobian.mT @ inner @ jacobian}
+    parameters, expected = list(net.parameters()), {"exact": hessian, "gauss_newton": jacobian.mT @ inner @ jacobian}
+    dense = {mode: zh.CurvatureOperator(loss, parameters, mode=mode).to_dense() for mode in expected}
+    return Case(loss, parameters, expected, dense)
 
 
 @pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
 def test_dense_matches_torch_func(case, mode):
-    loss, parameters, truth = case
-    dense = zh.CurvatureOperator(loss, parameters, mode=mode).to_dense()
+    dense, truth = case.dense[mode], case.truth
     assert (dense - truth[mode]).abs().max() < 5e-3 * truth[mode].abs().max()
     torch.testing.assert_close(dense, dense.mT, rtol=0, atol=1e-12 * float(dense.abs().max()))
 
 
 def test_modes_differ_by_the_curvature_of_the_network(case):
-    loss, parameters, truth = case
-    difference = zh.CurvatureOperator(loss, parameters).to_dense()
-    difference -= zh.CurvatureOperator(loss, parameters, mode="gauss_newton").to_dense()
+    truth, difference = case.truth, case.dense["exact"] - case.dense["gauss_newton"]
     expected = truth["exact"] - truth["gauss_newton"]
     assert expected.abs().max() > 1e-2 * truth["exact"].abs().max()
     assert (difference - expected).abs().max() < 5e-3 * truth["exact"].abs().max()
@@ -73,9 +83,8 @@ def test_modes_differ_by_the_curvature_of_the_network(case):
 
 @pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
 def test_products_match_the_dense_matrix(case, mode):
-    loss, parameters, _ = case
-    operator = zh.CurvatureOperator(loss, parameters, mode=mode)
-    dense = operator.to_dense()
+    loss, parameters, _, every = case
+    operator, dense = zh.CurvatureOperator(loss, parameters, mode=mode), every[mode]
     block = torch.randn(operator.shape[0], 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     torch.testing.assert_close(operator @ block, dense @ block)
     torch.testing.assert_close(operator @ block[:, 0], dense @ block[:, 0])

@@ -35,7 +35,7 @@ def inputs(n: int) -> tuple[Tensor, Tensor]:
     return x.expand(R, n), torch.tensor([[0.3, -0.5]], dtype=torch.float64).expand(R, 2)
 
 
-def check(drawn: Callable[[], Tensor], calls: int = 200) -> None:
+def check(drawn: Callable[[], Tensor], calls: int = 100) -> None:
     """Compare the spread of R independent estimates [R, n] with the error of their mean, over many calls."""
     each = torch.stack([drawn() for _ in range(calls)])
     told, error = each.var(1).mean(0) / R, each.mean(1).var(0)
@@ -43,7 +43,7 @@ def check(drawn: Callable[[], Tensor], calls: int = 200) -> None:
     assert float(z.abs().max()) < 5, "variances of nearly normal numbers"
 
 
-@pytest.mark.parametrize(("n", "pathwise"), [(1, 2), (3, 0), (3, 1), (3, 2), (70, 2)])
+@pytest.mark.parametrize(("n", "pathwise"), [(1, 2), (3, 0), (3, 1), (70, 2)])
 def test_the_spread_of_losses_over_a_memory_is_the_error_of_their_mean(n: int, pathwise: int) -> None:
     torch.manual_seed(0)
     box, (x, r) = layer(n, pathwise), inputs(n)

@@ -108,9 +108,22 @@ def close(samples: list[list[Tensor]], exact: list[Tensor]) -> None:
         assert error < 0.3 * size, "or the comparison says nothing"
 
 
-@pytest.mark.parametrize("n", [2, 20])
-@pytest.mark.parametrize("surrogate", ["automatic", "bent"])
-@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize(
+    ("name", "surrogate", "n"),
+    [
+        ("absolute", "automatic", 20),
+        ("absolute", "bent", 2),
+        ("step", "automatic", 20),
+        ("huber", "automatic", 20),
+        ("huber", "bent", 2),
+        ("square", "automatic", 2),
+        ("square", "bent", 20),
+        ("ramp", "automatic", 20),
+        ("ramp", "bent", 2),
+        ("product", "automatic", 2),
+        ("product", "bent", 20),
+    ],
+)
 def test_value_and_derivatives_are_unbiased(name: str, surrogate: str, n: int) -> None:
     torch.manual_seed(0)
     fn = identity if surrogate == "automatic" else bent
@@ -126,7 +139,7 @@ def test_value_and_derivatives_are_unbiased(name: str, surrogate: str, n: int) -
         assert memory.pathwise == min(ORDERS[name], 2 if surrogate == "automatic" else 1)
 
 
-@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("name", ["absolute", "step", "huber", "product"])
 def test_estimates_are_unbiased(name: str) -> None:
     torch.manual_seed(0)
     memory = zh.Memory()
@@ -146,7 +159,7 @@ def test_estimates_are_unbiased(name: str) -> None:
     close(found, [*exact, hessian])
 
 
-@pytest.mark.parametrize("n", [2, 20])
+@pytest.mark.parametrize("n", [2, 12])
 def test_transforms_before_anything_was_looked_at(n: int) -> None:
     torch.manual_seed(0)
     memory = zh.Memory()
@@ -283,9 +296,17 @@ class Once(Square):
         return result
 
 
-@pytest.mark.parametrize("n", [2, 10])
-@pytest.mark.parametrize("function", [Square, Once])
-@pytest.mark.parametrize("door", ["head", "surrogate", "both"])
+@pytest.mark.parametrize(
+    ("door", "function", "n"),
+    [
+        ("head", Square, 10),
+        ("head", Once, 2),
+        ("surrogate", Square, 2),
+        ("surrogate", Once, 10),
+        ("both", Square, 2),
+        ("both", Once, 10),
+    ],
+)
 def test_operations_without_a_forward_mode(door: str, function: Any, n: int) -> None:
     torch.manual_seed(0)
     own = Fixed(lambda z: z + function.apply(z) - z * z) if door != "head" else None

@@ -88,7 +88,7 @@ def test_slopes_by_transforms_are_as_accurate_as_by_backward(name: str) -> None:
     """sin and cos of n parameters have the slopes cos and -sin, times exp(-sigma^2 / 2). Stein's sums err by 0.02."""
     x = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64).view(3, 2)
     box, found = refitted(1), []
-    for _ in range(10):
+    for _ in range(4):
         box.memory.pathwise = None
         found.append(TRANSFORMS[name](box, x))
         assert box.memory.pathwise == 2
@@ -100,7 +100,7 @@ def test_slopes_by_transforms_are_as_accurate_as_by_backward(name: str) -> None:
 def test_hessians_by_transforms_are_as_accurate_as_by_backward(name: str) -> None:
     x = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64).view(3, 2)
     box, found = refitted(2), []
-    for _ in range(10):
+    for _ in range(4):
         box.memory.pathwise = None
         found.append(SECOND[name](box, x))
         assert box.memory.pathwise == 2

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 import torch_zerohess as zh
 
 FREQUENCIES = torch.tensor([[1.0, 0.4], [-0.3, 1.2], [0.7, 0.9]])  # [m, n]
-SEEDS, STEPS, BATCH = 5, 40, 16
+SEEDS, STEPS, BATCH = 3, 40, 16
 SIZE = 0.1
 """First step size: learning rate of Adam, trust radius of Newton."""
 
@@ -72,7 +72,7 @@ def error_after(optimizer: str, seed: int, memory: zh.Memory | None) -> tuple[fl
 def test_an_untrained_network_as_surrogate_leaves_the_final_error_as_it_is(optimizer: str) -> None:
     """The mean of log(error with it / error without it) over seeds is zero within its noise.
 
-    One such logarithm has a standard deviation of 0.2 (Adam) and 0.3 (Newton), the mean of five of 0.13 at most. Both
+    One such logarithm has a standard deviation of 0.2 (Adam) and 0.3 (Newton), the mean of three of 0.17 at most. Both
     methods divide the error by more than ten. With a coefficient of 1 the mean is 3 and more.
     """
     logarithms = []
@@ -83,4 +83,4 @@ def test_an_untrained_network_as_surrogate_leaves_the_final_error_as_it_is(optim
         logarithms.append((math.log(without / before), math.log(with_memory / without)))
     gain, change = (sum(one) / SEEDS for one in zip(*logarithms, strict=True))
     assert gain < -math.log(10.0)
-    assert abs(change) < 5 * 0.13
+    assert abs(change) < 0.65

@@ -113,7 +113,7 @@ def test_fake_tensors_have_the_shapes_of_real_ones() -> None:
 
 
 @pytest.mark.usefixtures("memory")
-@pytest.mark.parametrize("proposal", ["aggregate", "optimal"])
+@pytest.mark.parametrize(("memory", "proposal"), [("stored", "optimal"), ("redrawn", "aggregate")], indirect=["memory"])
 def test_symbolic_traces_compute_what_they_traced(proposal: str) -> None:
     layer, x = BlackBox(F, S.replace(proposal=proposal)), BATCH[1]
     for f in (torch.func.grad(layer), torch.func.hessian(layer)):
@@ -235,9 +235,8 @@ def test_older_compilers_get_the_layer_between_two_graphs(monkeypatch) -> None:
         torch.compile(layer, backend="eager", fullgraph=True)(X)
 
 
-@pytest.mark.parametrize("redrawn", [False, True])
+@pytest.mark.parametrize(("seed", "redrawn"), [(12, True), (None, False)])
 @pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
-@pytest.mark.parametrize("seed", [12, None])
 def test_a_linearized_layer_is_one_linear_function(
     seed: int | None, redrawn: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,8 +262,7 @@ def test_a_linearized_layer_is_one_linear_function(
 
 @pytest.mark.usefixtures("short_climbs")
 @pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
-@pytest.mark.parametrize("training", [False, True])
-@pytest.mark.parametrize("fresh", [None, 2])
+@pytest.mark.parametrize(("fresh", "training"), [(None, False), (2, True)])
 def test_a_linearized_layer_with_a_memory_is_one_linear_function(fresh: int | None, training: bool) -> None:
     layer = BlackBox(lambda z: z.sin(), S.replace(samples=50), head=SquaredError(), memory=Memory(fresh=fresh))
     references, direction = torch.ones_like(BATCH), BATCH.flip(0)

@@ -10,7 +10,7 @@ using namespace zerohess;
 
 namespace {
 
-constexpr int64_t kSizes[] = {1, 2, 3, 7, 127, 128, 129, 255, 256, 257, 1000};
+constexpr int64_t kSizes[] = {1, 2, 3, 7, 127, 128, 129, 255, 256, 257, 385};
 constexpr int64_t kSeeds[] = {0, 1, int64_t(1) << 32, std::numeric_limits<int64_t>::max()};
 
 bool near(double a, double b, double bound) { return std::fabs(a - b) <= bound; }

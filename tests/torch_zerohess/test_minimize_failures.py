@@ -35,7 +35,7 @@ def rough(x: Tensor) -> Tensor:
     return curve(x) + 0.3 * torch.randn(len(TIMES), generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_failures_are_no_noise(seed: int) -> None:
     settings = {"sigma": 0.8, "bounds": (0.01, 4.0), "loss": squares, "seed": seed}
     fit = zh.minimize(failing, [1.0, 0.2], vectorized=False, max_evaluations=60, **settings)
@@ -49,8 +49,7 @@ def test_failures_are_no_noise(seed: int) -> None:
     assert search.value == float(squares(failing(search.x))) < 1e-12
 
 
-@pytest.mark.parametrize("seed", range(2, 5))
-@pytest.mark.parametrize("noise", [None, 0.0])
+@pytest.mark.parametrize(("seed", "noise"), [(2, None), (3, 0.0)])
 def test_a_rough_function_has_the_lowest_loss_that_was_evaluated(seed: int, noise: float | None) -> None:
     settings = {"sigma": 1.0, "bounds": (0.0, 3.0), "loss": squares, "vectorized": False, "seed": seed, "noise": noise}
     fit = zh.minimize(rough, [0.2, 2.0], max_evaluations=100, **settings)

@@ -1,7 +1,5 @@
 """In noise, x is the minimum of a regression on all evaluations, where the regression is sure of a lower loss there."""
 
-import statistics
-
 import pytest
 import torch
 from searches import noisy
@@ -34,25 +32,25 @@ def around(fn, noise, seed, count=80, width=0.5):
 def test_x_is_as_exact_as_all_evaluations_together():
     """Noise of 0.01: the best of evaluated points, by repeats alone, is off by 1e-3."""
     ends = []
-    for seed in range(4):
+    for seed in range(2):
         f = noisy(quadratic, 0.01, seed)
         fit = zh.minimize(f, [1.0, 1.0], sigma=0.5, bounds=(-2, 2), max_evaluations=150, seed=seed)
         ends.append(float(quadratic(fit.x[None])))
         assert abs(fit.value - ends[-1]) < 5 * fit.value_error
         assert bool((fit.gradient.abs() < 5 * fit.standard_errors["gradient"]).all())
-    assert statistics.median(ends) < 1e-5
+    assert max(ends) < 1e-5
 
 
 @pytest.mark.parametrize(("fn", "most"), [(quadratic, 2e-3), (cosh, 1e-2)])
 def test_the_minimum_is_found_from_far_away(fn, most):
-    for seed in range(4):
+    for seed in range(2):
         x = modelled_minimum(vector(1.5, 1.2), around(fn, 0.1, seed), everywhere(2))
         assert float(fn(x[None])) < most
 
 
 def test_a_minimum_that_is_no_lower_for_sure_leaves_x():
     x = vector(0.3, 0.3)
-    for seed in range(4):
+    for seed in range(2):
         assert torch.equal(modelled_minimum(x, around(quadratic, 0.1, seed), everywhere(2)), x)
 
 
@@ -99,22 +97,22 @@ def line(z):
     return z[:, :1] + z[:, 1:] * TIMES
 
 
-@pytest.mark.parametrize("image", [decay, line])
-@pytest.mark.parametrize(("engine", "bounds"), [("auto", None), ("auto", (-5, 5)), ("descent", (-5, 5))])
+@pytest.mark.parametrize(
+    ("image", "engine", "bounds"),
+    [(decay, "auto", None), (decay, "auto", (-5, 5)), (line, "descent", (-5, 5))],
+)
 def test_noisy_outputs_tell_x_together(image, engine, bounds):
     """Noise of 0.1 in 30 numbers. The limit of 150 evaluations is 1e-4; a model of losses alone is off by 0.1."""
-    target, ends = image(vector(1.3, 2.0)[None])[0], []
-    for seed in range(3):
-        generator = torch.Generator().manual_seed(seed)
+    target, generator = image(vector(1.3, 2.0)[None])[0], torch.Generator().manual_seed(0)
 
-        def noisy_image(z, generator=generator):
-            return image(z) + 0.1 * torch.randn(len(z), 30, generator=generator, dtype=torch.float64)
+    def noisy_image(z):
+        return image(z) + 0.1 * torch.randn(len(z), 30, generator=generator, dtype=torch.float64)
 
-        settings = {"sigma": 0.5, "bounds": bounds, "engine": engine, "max_evaluations": 150, "seed": seed}
-        fit = zh.minimize(noisy_image, [0.5, 1.0], loss=lambda y: (y - target).square().sum(), **settings)
-        ends.append(float((image(fit.x[None])[0] - target).square().sum()))
-        assert abs(fit.value - ends[-1] - 30 * 0.1**2) < 5 * fit.value_error
-    assert statistics.median(ends) < 3e-3
+    settings = {"sigma": 0.5, "bounds": bounds, "engine": engine, "max_evaluations": 150, "seed": 0}
+    fit = zh.minimize(noisy_image, [0.5, 1.0], loss=lambda y: (y - target).square().sum(), **settings)
+    end = float((image(fit.x[None])[0] - target).square().sum())
+    assert end < 3e-3
+    assert abs(fit.value - end - 30 * 0.1**2) < 5 * fit.value_error
 
 
 def test_a_record_keeps_the_latest_outputs(monkeypatch):

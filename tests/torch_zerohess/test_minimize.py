@@ -34,8 +34,8 @@ def test_of_a_quadratic():
 
 
 def test_derivatives_of_a_noisy_quadratic_are_within_their_errors():
-    """Six standard errors, of 20 runs with noise of 0.05: errors are estimates themselves, from few evaluations."""
-    for seed in range(20):
+    """Six standard errors, of 8 runs with noise of 0.05: errors are estimates themselves, from few evaluations."""
+    for seed in range(8):
         generator = torch.Generator().manual_seed(seed)
 
         def f(z, generator=generator):

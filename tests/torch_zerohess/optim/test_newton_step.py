@@ -119,7 +119,7 @@ def plateaus(z: torch.Tensor) -> torch.Tensor:
     return (z.round() - torch.tensor([3.0, -2.0])).square().sum(1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @BOTH
 def test_a_plateau_is_left_and_the_radius_is_there_for_the_next_goal(optimizer, seed: int) -> None:
     """The value of the layer is that of fn, and most steps lead to exactly the same."""
@@ -238,7 +238,7 @@ def test_the_radius_has_an_end_where_every_step_raises_the_loss(optimizer, dtype
 def test_the_radius_outlives_a_loss_that_underflows(optimizer, dtype) -> None:
     x, goal = torch.ones(3, dtype=dtype, requires_grad=True), 0.0
     steps = optimizer([x])
-    for _ in range(400 if dtype == torch.float32 else 1200):
+    for _ in range(150 if dtype == torch.float32 else 600):  # it underflows after 65 and 465
         loss = steps.step(lambda: (x - goal).pow(4).sum())
     assert float(loss) < 1e-37
     goal = 10.0

@@ -311,7 +311,7 @@ HEADS = {"squares": zh.heads.SquaredError(), "entropy": zh.heads.LocalEntropy(zh
 def test_sampled_losses_are_of_their_own_elements(n: int, dtype: torch.dtype) -> None:
     """No layer is refused, from the first call to the last, near a minimum."""
     torch.manual_seed(0)
-    wanted = torch.randn(24, n, dtype=dtype)
+    wanted = torch.randn(10, n, dtype=dtype)
     layers = {name: make() for name, make in LAYERS.items()}
     losses = {name: lambda y, name=name: (layers[name](y) - wanted).square().sum(1) for name in layers}
     for name, head in HEADS.items():
@@ -319,7 +319,7 @@ def test_sampled_losses_are_of_their_own_elements(n: int, dtype: torch.dtype) ->
             layer = zh.BlackBox(torch.sin, zh.Smoothing(sigma=0.5, samples=4), head=head, memory=memory)
             losses[f"{name} {memory}"] = lambda y, layer=layer: layer(y, wanted)
     for one in losses.values():
-        targets, y = NewtonTargets(relative_damping=0.1, output_radius=0.5), torch.zeros(24, n, dtype=dtype)
+        targets, y = NewtonTargets(relative_damping=0.1, output_radius=0.5), torch.zeros(10, n, dtype=dtype)
         for _ in range(5):
             y = targets(one, y)
         assert bool(torch.isfinite(y).all())

@@ -165,11 +165,19 @@ def test_every_evaluation_is_in_the_history():
 
 def test_a_lucky_draw_does_not_reach_the_target():
     """Of 100 draws around .5 with a deviation of .3 many lie below 0; the mean never does."""
-    settings = {"sigma": 2.0, "bounds": (-5, 5), "max_evaluations": 100, "target": 0.3}
-    fit = zh.minimize(noisy(0, 0.3, lambda z: bowl(z) + 0.5), zeros(2), seed=0, **settings)
-    assert fit.status != "target"
-    assert not fit.success
-    assert distinct_points(fit) >= 80  # nor is it worth a decision
+    for seed in range(3):
+        fit = zh.minimize(
+            noisy(seed, 0.3, lambda z: bowl(z) + 0.5),
+            zeros(2),
+            sigma=2.0,
+            bounds=(-5, 5),
+            seed=seed,
+            max_evaluations=100,
+            target=0.3,
+        )
+        assert fit.status != "target"
+        assert not fit.success
+        assert distinct_points(fit) >= 80  # nor is it worth a decision
 
 
 def test_noise_survives_a_checkpoint(tmp_path):
@@ -456,11 +464,11 @@ def test_in_noise_the_minimum_is_what_the_search_believes():
         return (y.square() * (1.0 + 0.2 * (4.0 * y.abs().clamp_min(1e-12).log()).sin()) * sizes).sum(1)
 
     ends = []
-    for seed in range(2):
+    for seed in range(5):
         f = noisy(seed, 1.0, fn=valley)
         fit = zh.minimize(f, zeros(5) - 4.0, sigma=2.0, noise=1.0, seed=seed, max_evaluations=600)
         ends.append(float(valley(fit.x[None])[0]))
-    assert max(ends) < 0.05
+    assert sorted(ends)[3] < 0.05
 
 
 def test_two_points_with_low_values_may_be_best_besides_the_likely_ones():

@@ -34,17 +34,19 @@ class PerCall:
         return torch.cat([z, noise.expand(len(z), 1)], 1) if self.output else squares(z) + noise[0]
 
 
-@pytest.mark.parametrize(("output", "noise"), [(False, None), (True, None), (True, NOISE)])
+@pytest.mark.parametrize("noise", [None, NOISE])
+@pytest.mark.parametrize("output", [False, True])
 def test_noise_that_a_call_shares_is_seen_and_averaged(output, noise) -> None:
-    """Within four errors. The luckiest draw of 150 is 0.8 too low."""
+    """Within four errors, in three runs of each kind. The luckiest draw of 150 is 0.8 too low."""
     settings = SETTINGS | {"loss": shifted if output else None, "noise": noise}
-    f = PerCall(0, output=output)
-    fit = zh.minimize(f, [1.5, 1.5], seed=0, **settings)
-    assert 0.3 * NOISE < fit.noise < 2.0 * NOISE
-    assert 0.03 < fit.value_error < 0.25
-    assert abs(fit.value - float(squares(fit.x[None]))) < 4 * fit.value_error
-    assert fit.evaluations == len(fit.history) == 150
-    assert torch.equal(torch.cat(f.calls), fit.points)
+    for seed in range(3):
+        f = PerCall(seed, output=output)
+        fit = zh.minimize(f, [1.5, 1.5], seed=seed, **settings)
+        assert 0.3 * NOISE < fit.noise < 2.0 * NOISE
+        assert 0.03 < fit.value_error < 0.25
+        assert abs(fit.value - float(squares(fit.x[None]))) < 4 * fit.value_error
+        assert fit.evaluations == len(fit.history) == 150
+        assert torch.equal(torch.cat(f.calls), fit.points)
 
 
 def test_a_batch_keeps_noise_that_a_call_shares(tmp_path) -> None:

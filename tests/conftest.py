@@ -1,8 +1,11 @@
 """What every run of the tests does, and what several folders share."""
 
 import gc
+import multiprocessing
 import os
 from collections.abc import Iterator
+from multiprocessing.context import BaseContext
+from types import SimpleNamespace
 
 import pytest
 
@@ -33,3 +36,23 @@ def quick_inductor() -> Iterator[None]:
 def short_climbs(monkeypatch: pytest.MonkeyPatch) -> None:
     """The surrogate of a memory takes a fifth of the steps to its lengths, which are most of the time of a fit."""
     monkeypatch.setattr("torch_zerohess.surrogates.lengths._ITERATIONS", 4)
+
+
+@pytest.fixture(scope="session")
+def forking() -> BaseContext:
+    """Of processes that one process forks, which has imported torch once. New ones (spawn) take seconds to import it.
+
+    Where there is no fork, new ones are made.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torch_zerohess"])
+    return context
+
+
+@pytest.fixture
+def quick_workers(forking: BaseContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are forked."""
+    changed = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda method: forking})
+    monkeypatch.setattr("torch_zerohess.evaluators.lifetime.multiprocessing", changed)

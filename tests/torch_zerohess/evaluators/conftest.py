@@ -1,4 +1,4 @@
-"""Workers that the tests of one file share, because a worker takes seconds to start."""
+"""Workers that the tests of one file share."""
 
 import pytest
 
@@ -6,6 +6,11 @@ from torch_zerohess.evaluators import ProcessPool
 
 
 @pytest.fixture(scope="module")
-def pool():
+def shared_pool():
     with ProcessPool(2, retries=0) as one:
         yield one
+
+
+@pytest.fixture
+def pool(shared_pool, quick_workers):
+    return shared_pool

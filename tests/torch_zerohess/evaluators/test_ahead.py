@@ -131,6 +131,7 @@ def test_the_thread_ends_when_nobody_has_the_evaluator():
         assert not thread.is_alive()
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_workers_end_when_nobody_has_the_pool():
     before, threads = set(multiprocessing.active_children()), set(threading.enumerate())
     pool = ProcessPool(1)

@@ -33,11 +33,20 @@ def loky():
     return loky.ProcessPoolExecutor(1)
 
 
+class Processes(dict):
+    """An executor of each kind, with one process, which takes seconds to start."""
+
+    def __missing__(self, make):
+        self[make] = make()
+        return self[make]
+
+
 @pytest.fixture(scope="module")
 def processes():
-    """One process of each kind for several tests: each takes seconds to start."""
-    with standard() as one, loky() as other:
-        yield {standard: one, loky: other}
+    made = Processes()
+    yield made
+    for one in made.values():
+        one.shutdown()
 
 
 @pytest.mark.parametrize("make", [standard, loky])
@@ -55,20 +64,6 @@ def test_an_error_that_cannot_be_read_is_named_and_breaks_no_pool(make, processe
 def test_a_thread_raises_the_error_itself(threads):
     with pytest.raises(black_boxes.Odd):
         Executor(threads)(black_boxes.odd, Z)
-
-
-@pytest.mark.parametrize("make", [standard, loky])
-def test_pools_of_processes(make, tmp_path):
-    with make() as pool:
-        evaluator = Executor(pool)
-        fn = Factory(black_boxes.Counted, tmp_path / "made")
-        for _ in range(2):
-            assert torch.equal(evaluator(fn, Z), black_boxes.waves(Z))
-        assert len((tmp_path / "made").read_text().split()) == 1
-        with pytest.raises(ArithmeticError, match="no value above one half"):
-            evaluator(black_boxes.failing, Z)
-        with pytest.raises(concurrent.futures.BrokenExecutor):
-            evaluator(black_boxes.never, Z)
 
 
 def test_workers_have_the_default_type_of_the_caller(processes):
@@ -181,3 +176,19 @@ def test_a_black_box_that_has_changed_is_sent_again(processes):
     assert torch.equal(evaluator(fn, Z), Z.sum(1))
     fn.factor = 10.0
     assert torch.equal(evaluator(fn, Z), 10.0 * Z.sum(1))
+
+
+@pytest.mark.parametrize("make", [standard, loky])
+def test_pools_of_processes(make, processes, tmp_path):
+    """At the end they are broken, so this is the last test."""
+    with processes[make] as pool:
+        del processes[make]
+        evaluator = Executor(pool)
+        fn = Factory(black_boxes.Counted, tmp_path / "made")
+        for _ in range(2):
+            assert torch.equal(evaluator(fn, Z), black_boxes.waves(Z))
+        assert len((tmp_path / "made").read_text().split()) == 1
+        with pytest.raises(ArithmeticError, match="no value above one half"):
+            evaluator(black_boxes.failing, Z)
+        with pytest.raises(concurrent.futures.BrokenExecutor):
+            evaluator(black_boxes.never, Z)

@@ -29,6 +29,7 @@ def values_of(make):
         return values
 
 
+@pytest.mark.usefixtures("quick_workers")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_seeds_differ_between_workers_and_from_those_here():
     """Among 240 seeds below 2^31 any two are equal with probability 1e-5."""

@@ -1,9 +1,10 @@
 """Worker processes: the same bits as in this process, and what becomes of black boxes that crash, hang or raise.
 
-A worker takes seconds to start, so tests share one pool where they can.
+A worker takes seconds to start, so most are forked (`quick_workers`), and tests share one pool where they can.
 """
 
 import functools
+import gc
 import math
 import multiprocessing
 import os
@@ -88,11 +89,10 @@ def test_chunks_with_values_of_two_types_have_the_wider_one():
     assert torch.equal(batch.result(), torch.ones(2, 3, dtype=torch.float64))
 
 
-def test_workers_are_other_processes_with_one_thread(pool):
+def test_workers_are_other_processes(pool):
     found = pids(pool)
     assert 1 <= len(found) <= 2
     assert os.getpid() not in found
-    assert pool(black_boxes.threads, points(2)).tolist() == [[1.0, 1.0]] * 2
 
 
 def test_the_black_box_may_take_single_points_or_none(pool):
@@ -132,6 +132,7 @@ def test_a_factory_is_called_once_in_every_worker(pool, tmp_path):
     assert (tmp_path / "made").read_text().split() == [*made, str(os.getpid())]
 
 
+@pytest.mark.usefixtures("quick_workers")
 @pytest.mark.parametrize(("limit", "count"), [(None, 5), (10**12, 9)])
 def test_a_worker_keeps_the_black_boxes_that_were_used_last(tmp_path, limit, count):
     boxes = [Factory(black_boxes.Counted, tmp_path / "made") for _ in range(5)]
@@ -202,6 +203,7 @@ def test_a_worker_of_a_data_loader_is_told_that_it_cannot_have_workers(monkeypat
         loader = torch.utils.data.DataLoader(points(3), num_workers=1, collate_fn=functools.partial(collated, pool))
         with pytest.raises(RuntimeError, match=r"such as a worker of a DataLoader: leave evaluator=None there"):
             next(iter(loader))
+    gc.collect()  # the error holds the iterator, which waits here
 
 
 def test_values_of_different_shapes_are_refused(pool):
@@ -330,6 +332,7 @@ def test_a_slow_point_is_waited_for_before_a_call_is_hopeless():
     assert batch.hopeless
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_a_black_box_that_always_ends_its_process_is_given_up_early(tmp_path, monkeypatch):
     """The search needs 4 values at first, with 3 tries each: 12 evaluations. After 3 it is given up here."""
     monkeypatch.setattr("torch_zerohess.evaluators.batch._FAILURES", 2)
@@ -424,12 +427,13 @@ def test_an_estimate_without_every_third_point_is_unbiased():
     assert abs(kept - (2 / 3) ** 2) < 0.04  # a pair stays if both of its points do; 5 standard errors
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_kills_and_hangs_change_no_bit(tmp_path):
     z = points(200)
     fn = black_boxes.Disturbed(tmp_path)
     with ProcessPool(2, timeout=20.0, retries=5) as pool:
         assert torch.equal(pool(fn, z), black_boxes.waves(z))
-        pool.timeout = 5.0  # of one evaluation, once the workers are there; a slow one is tried again
+        pool.timeout = 2.0  # of one evaluation, once the workers are there; a slow one is tried again
         for name in ("kill-0", "hang-0"):
             (tmp_path / name).touch()
         assert torch.equal(pool(fn, z), black_boxes.waves(z))
@@ -439,6 +443,7 @@ def test_kills_and_hangs_change_no_bit(tmp_path):
     assert not [pid for pid in children if alive(pid)]
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_a_worker_that_takes_too_much_memory_is_replaced_and_one_that_is_old_too():
     with ProcessPool(1, retries=0, recycle=2, memory_limit=10**10) as pool:
         first, second, third = pool(black_boxes.process, points(3)).tolist()
@@ -449,17 +454,21 @@ def test_a_worker_that_takes_too_much_memory_is_replaced_and_one_that_is_old_too
             pool(black_boxes.hungry, torch.zeros(1, 2))
 
 
-ORPHAN = """
-import os, signal, sys, time
+ORPHANS = """
+import os, signal
 import torch
 import black_boxes
 from torch_zerohess.evaluators import ProcessPool
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
-    pool = ProcessPool(1)
-    print(int(pool(black_boxes.process, torch.zeros(1, 1, dtype=torch.float64))), flush=True)
-    if sys.argv[1] == "sleep":
-        pool(black_boxes.asleep, torch.zeros(1, 1))
+    for _ in range(2):
+        if not os.fork():  # a parent that need not import torch
+            pool = ProcessPool(1)
+            worker = int(pool(black_boxes.process, torch.zeros(1, 1, dtype=torch.float64)))
+            os.write(1, f"{os.getpid()} {worker}\\n".encode())
+            pool(black_boxes.asleep, torch.zeros(1, 1))
+    for _ in range(2):
+        os.wait()
 """
 
 
@@ -488,39 +497,50 @@ if __name__ == "__mp_main__":  # in the worker
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=interrupt).start()
-    with ProcessPool(1, retries=0) as pool:
-        print(len(pool(black_boxes.process, torch.ones(1, 2))))
+    pool = ProcessPool(1, retries=0)
+    print(int(pool(black_boxes.process, torch.ones(1, 2, dtype=torch.float64))))
 """
 
 
-@pytest.mark.parametrize("end", ["return", "SIGINT", "SIGKILL"])
-def test_no_worker_outlives_its_parent(end, tmp_path):
+def ends(pid: int) -> bool:
+    until = time.monotonic() + 60
+    while alive(pid) and time.monotonic() < until:
+        time.sleep(0.02)
+    return not alive(pid)
+
+
+@pytest.fixture
+def environment():
+    """Of scripts that import what tests import."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+
+
+def test_no_worker_outlives_its_parent(tmp_path, environment):
+    """Ctrl-C or SIGKILL ends the parent while its worker hangs."""
     script = tmp_path / "script.py"
-    script.write_text(ORPHAN)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    program = [sys.executable, str(script), "return" if end == "return" else "sleep"]
+    script.write_text(ORPHANS)
+    program = [sys.executable, str(script)]
     with subprocess.Popen(
         program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as parent:
-        assert parent.stdout is not None
-        worker = int(parent.stdout.readline())
-        if end != "return":
-            assert parent.stdout.readline() == "asleep\n"
-            parent.send_signal(getattr(signal, end))
-        parent.wait(60)
-        until = time.monotonic() + 60
-        while alive(worker) and time.monotonic() < until:
-            time.sleep(0.02)
-        assert not alive(worker)
+    ) as grandparent:
+        lines = [grandparent.stdout.readline() for _ in range(4)]
+        assert lines.count("asleep\n") == 2
+        families = [map(int, line.split()) for line in lines if line != "asleep\n"]
+        for (parent, worker), end in zip(families, (signal.SIGINT, signal.SIGKILL), strict=True):
+            os.kill(parent, end)
+            assert ends(parent)
+            assert ends(worker)
+        assert grandparent.wait(60) == 0
 
 
-def test_ctrl_c_does_not_end_a_worker_that_imports(tmp_path):
+def test_ctrl_c_does_not_end_a_worker_that_imports(tmp_path, environment):
+    """It ends with the interpreter, and nothing is printed about that."""
     script = tmp_path / "script.py"
     script.write_text(IMPORTING)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, str(script), str(tmp_path)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("1\n", "")
+    assert done.stderr == ""
+    assert ends(int(done.stdout))
 
 
 def test_arguments_are_checked():
@@ -544,10 +564,11 @@ def test_arguments_are_checked():
         zh.minimize(black_boxes.waves, torch.zeros(2), sigma=1.0, workers=2, evaluator=Inline())
 
 
-def test_a_pool_is_closed_for_good_and_copied_by_its_settings():
+def test_a_pool_of_new_processes_with_one_thread_is_closed_for_good_and_copied_by_its_settings():
     with ProcessPool(3, timeout=20.0, retries=4) as pool:
         assert torch.equal(pool(black_boxes.waves, points(1)), black_boxes.waves(points(1)))
         assert len(pool._staffed) == 1  # more workers than points
+        assert pool(black_boxes.threads, points(1)).tolist() == [[1.0, 1.0]]
         copy = pickle.loads(pickle.dumps(pool))
         assert (
             repr(copy)
@@ -559,6 +580,7 @@ def test_a_pool_is_closed_for_good_and_copied_by_its_settings():
     pool.close()
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_a_pool_that_is_closed_while_a_worker_makes_its_black_box_prints_nothing(tmp_path, capfd):
     pool = ProcessPool(1)
     call = pool.submit(Factory(black_boxes.made_late, tmp_path / "begun"), points(1))

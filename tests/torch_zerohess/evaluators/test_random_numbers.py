@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import functools
-import multiprocessing
 import pickle
 import random
 import sys
@@ -47,9 +46,8 @@ FIXED = {
 
 
 @pytest.fixture(scope="module")
-def executor():
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as workers:
+def executor(forking):
+    with concurrent.futures.ProcessPoolExecutor(2, mp_context=forking) as workers:
         yield Executor(workers)
 
 
@@ -75,6 +73,7 @@ def test_workers_leave_fixed_random_numbers_as_they_are(name, pool, executor):
             assert torch.equal(workers(fn, points), expected)
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_the_time_of_an_evaluation_that_is_made_again_begins_anew(monkeypatch):
     begun, begin = [], Process._begin
     monkeypatch.setattr(Process, "_begin", lambda one: (begin(one), begun.append(one.deadline)))

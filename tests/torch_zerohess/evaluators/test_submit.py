@@ -149,6 +149,7 @@ def test_a_lost_point_is_that_of_its_own_call(pool):
     assert pool.lost == {}
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_a_call_that_has_not_begun_can_be_cancelled_and_a_pool_that_is_closed_says_so(tmp_path):
     with ProcessPool(1) as pool:
         running = pool.submit(black_boxes.Meeting(tmp_path, 2), torch.zeros(1, 1))

@@ -3,7 +3,7 @@
 import gc
 import multiprocessing
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.context import BaseContext
 from types import SimpleNamespace
 
@@ -46,13 +46,22 @@ def forking() -> BaseContext:
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
+    from multiprocessing import forkserver
+
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torch_zerohess"])
+    context.set_forkserver_preload(["torch_zerohess", "experiments.ensembles.processes"])
+    forkserver.ensure_running()
     return context
 
 
-@pytest.fixture
-def quick_workers(forking: BaseContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Workers are forked."""
+@pytest.fixture(scope="session")
+def fork_workers(forking: BaseContext) -> Callable[[pytest.MonkeyPatch], None]:
+    """Let workers be forked until a patch is undone."""
     changed = SimpleNamespace(**{**vars(multiprocessing), "get_context": lambda method: forking})
-    monkeypatch.setattr("torch_zerohess.evaluators.lifetime.multiprocessing", changed)
+    return lambda patched: patched.setattr("torch_zerohess.evaluators.lifetime.multiprocessing", changed)
+
+
+@pytest.fixture
+def quick_workers(fork_workers: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are forked."""
+    fork_workers(monkeypatch)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from experiments.ensembles.ensemble import Ensemble
 from experiments.methods import METHODS, Method
 from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.task import Output, Picture, Task, Truth
@@ -214,3 +215,14 @@ def trained(method, task=BUMP, number=0, **settings):
 
 SHIFT = Method("shift", "moves the last bias", train=shift)
 FAIL_TO_TRAIN = Method("fail_to_train", "an exception", train=fail_to_train)
+
+
+def run_ensemble(folder, gate, plans):
+    """In a process of its own, silently: run each method on its task, gated, side by side."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ[GATE] = str(gate)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+    ensemble = Ensemble(folder, range(1), jobs=len(plans))
+    ensemble.run([job for task, method in plans for job in ensemble.plan([task], [method])])

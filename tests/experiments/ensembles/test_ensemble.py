@@ -3,19 +3,16 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from endings import ends
 from small import (
     BUMP,
     CRASH,
     ELSEWHERE,
     FAIL,
-    GATE,
     GATED,
     GATED_BUMP,
     GIVE_UP,
@@ -25,6 +22,7 @@ from small import (
     SHIFT,
     SIZE,
     TASK,
+    run_ensemble,
     search,
 )
 from written_runs import rows
@@ -50,14 +48,17 @@ def logs(folder):
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def results(tmp_path_factory, fork_workers):
     folder = tmp_path_factory.mktemp("results")
     one = ensemble(folder)
     jobs = one.plan([TASK], [SEARCH, HALVE, FAIL, CRASH, GIVE_UP])
-    outcomes = one.run([job for job in jobs if (job.method_name, job.run) != ("crash", 0)])
+    with pytest.MonkeyPatch.context() as patched:
+        fork_workers(patched)
+        outcomes = one.run([job for job in jobs if (job.method_name, job.run) != ("crash", 0)])
     return folder, {(o.method, o.run): o for o in outcomes}
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_results_do_not_depend_on_the_number_of_processes(results, tmp_path):
     two = ensemble(tmp_path, jobs=2)
     outcomes = two.run(two.plan([TASK], [SEARCH, HALVE, FAIL]))
@@ -189,60 +190,39 @@ def test_settings_of_an_ensemble_are_checked(tmp_path, changes, message):
         Ensemble(folder=tmp_path, **changes)
 
 
-ENSEMBLE = """
-import signal
-import sys
-from pathlib import Path
-from small import GATED, GATED_BUMP, SEARCH
-from experiments.ensembles.ensemble import Ensemble
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
-    workers = int(sys.argv[3])
-    ensemble = Ensemble(Path(sys.argv[1]), range(workers), jobs=workers)
-    plan = {"search": ([GATED], [SEARCH]), "our_g": ([GATED_BUMP], ["our_g"])}
-    ensemble.run(ensemble.plan(*plan[sys.argv[2]]))
-"""
-
-
 @pytest.mark.parametrize(
-    ("by", "method", "task", "workers"),
-    [(signal.SIGKILL, "search", TASK, 2), (signal.SIGINT, "search", TASK, 1), (signal.SIGKILL, "our_g", BUMP, 1)],
-    ids=["SIGKILL", "SIGINT", "network"],
+    ("by", "plans"),
+    [(signal.SIGKILL, [(GATED, SEARCH), (GATED_BUMP, "our_g")]), (signal.SIGINT, [(GATED, SEARCH)])],
+    ids=["SIGKILL", "SIGINT"],
 )
-def test_a_killed_ensemble_goes_on(tmp_path, one_process, by, method, task, workers):
+def test_a_killed_ensemble_goes_on(tmp_path, forking, one_process, by, plans):
     """All processes end with the killed process; started again, the ensemble has the rows of an undisturbed one."""
-    root = Path(__file__).parents[3]
-    script, folder, gate = tmp_path / "script.py", tmp_path / "out", tmp_path / "gate"
+    folder, gate = tmp_path / "out", tmp_path / "gate"
     gate.mkdir()
-    script.write_text(f"import sys\nsys.path[:0] = [{str(root)!r}, {str(root / 'tests')!r}]\n{ENSEMBLE}")
-    command = [sys.executable, str(script), str(folder), method, str(workers)]
-    gated = {**os.environ, GATE: str(gate)}
-    with subprocess.Popen(command, env=gated, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as killed:
-        while len(list(gate.iterdir())) < workers:  # until all of them wait in the black box
-            assert killed.poll() is None
-            time.sleep(0.01)
-        killed.send_signal(by)
-        assert killed.stdout is not None
-        assert killed.stdout.read() == b""  # to the end: no process holds the pipe any more
-    files = [Files(folder / f"gated{'_bump' if method == 'our_g' else ''}" / method, run) for run in range(workers)]
-    left = []
-    for one in files:
-        Journal(one.journal).close()  # nobody holds it
-        assert not one.outcome.exists()
-        left.append(one.log.read_bytes())
-        assert left[-1].count(b"\n") > 4
-    again = ensemble(folder, workers)
-    gated_task, known = (GATED_BUMP, "our_g") if method == "our_g" else (GATED, SEARCH)
-    assert len(again.run(again.plan([gated_task], [known]))) == workers
-    for one, before in zip(files, left, strict=True):
-        assert one.log.read_bytes().startswith(before[: before.rfind(b"\n") + 1])
-        whole = tmp_path / "whole"
-        known = {"search": SEARCH, "our_g": METHODS["our_g"]}[method]
-        attempt(task, method, one.run, lambda trial, known=known: known(trial, {}), whole)
-        expected = rows(Files(whole / task.name / method, one.run).log)
-        assert [replace(row, task=task.name) for row in rows(one.log)] == expected
-        assert one.weights.exists() == (method == "our_g")
+    killed = forking.Process(target=run_ensemble, args=(folder, gate, plans))
+    killed.start()
+    while len(waiting := list(gate.iterdir())) < len(plans):  # until all of them wait in the black box
+        assert killed.is_alive()
+        time.sleep(0.01)
+    os.kill(killed.pid, by)
+    assert all(ends(int(pid)) for pid in (killed.pid, *(one.name for one in waiting)))
+    left = {}
+    for task, method in plans:
+        files = Files(folder / task.name / getattr(method, "name", method), 0)
+        Journal(files.journal).close()  # nobody holds it
+        assert not files.outcome.exists()
+        left[files] = files.log.read_bytes()
+        assert left[files].count(b"\n") > 4
+    for (task, method), (files, before) in zip(plans, left.items(), strict=True):
+        again = ensemble(folder, 1)
+        assert len(again.run(again.plan([task], [method]))) == 1
+        assert files.log.read_bytes().startswith(before[: before.rfind(b"\n") + 1])
+        known, whole = METHODS.get(method, method), tmp_path / "whole"
+        undisturbed = TASK if task is GATED else BUMP
+        attempt(undisturbed, known.name, 0, lambda trial, known=known: known(trial, {}), whole)
+        expected = rows(Files(whole / undisturbed.name / known.name, 0).log)
+        assert [replace(row, task=undisturbed.name) for row in rows(files.log)] == expected
+        assert files.weights.exists() == (method == "our_g")
 
 
 def test_network_tasks_are_run_in_the_same_plan(tmp_path, one_process, capsys):

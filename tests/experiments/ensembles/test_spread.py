@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 from small import BUMP, GIVE_UP, SEARCH, SHIFT, TASK, Bump
 from written_runs import rows
@@ -65,13 +66,22 @@ def logs(folder):
     return {path.parent.name: rows(path) for path in sorted(folder.glob("*/*/*.jsonl"))}
 
 
+@pytest.mark.usefixtures("quick_workers", "one_process")
 def test_rows_do_not_depend_on_workers(tmp_path):
     for task, method in ((TASK, SEARCH), (Bump(BUMP.size), SHIFT)):
         attempt(task, method.name, 0, lambda trial, method=method: method(trial, {}), tmp_path / "alone")
     ensemble = Ensemble(tmp_path / "two", range(1), workers=2)
     outcomes = ensemble.run(ensemble.plan([TASK, BUMP], [SEARCH, SHIFT]))
+    processes._carriers.popitem()[1][0].close()
     assert [one.settings["workers"] for one in outcomes] == [2, 2]
     assert {one.status for one in outcomes} <= {"finished", "stopped"}
     found = logs(tmp_path / "two")
     assert found == logs(tmp_path / "alone")
     assert len(found) == 2
+
+
+@pytest.mark.usefixtures("quick_workers")
+def test_the_process_of_a_job_may_have_workers(tmp_path):
+    ensemble = Ensemble(tmp_path, range(1), workers=1)
+    (outcome,) = ensemble.run(ensemble.plan([TASK], [GIVE_UP]))
+    assert (outcome.status, outcome.reason) == ("stopped", "the method ended by itself")

@@ -8,6 +8,7 @@ import torch
 from experiments.studies import workers as study
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_kills_and_hangs_change_nothing_and_leave_nothing(tmp_path, capsys) -> None:
     out = tmp_path / "workers.json"
     costs, faults = study.workers(task=None, repeats=1, evaluations=600, kills=2, hangs=1, out=out)

@@ -14,12 +14,12 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import black_boxes
 import pytest
 import torch
 from black_boxes import part, points
+from endings import alive, ends
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
@@ -34,13 +34,6 @@ S = zh.Smoothing(sigma=0.3, samples=8, seed=0)
 
 def pids(pool: ProcessPool) -> set[int]:
     return {int(one) for one in pool(black_boxes.process, points(2 * MOST))}
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def test_values_have_the_bits_of_this_process(pool):
@@ -500,13 +493,6 @@ if __name__ == "__main__":
     pool = ProcessPool(1, retries=0)
     print(int(pool(black_boxes.process, torch.ones(1, 2, dtype=torch.float64))))
 """
-
-
-def ends(pid: int) -> bool:
-    until = time.monotonic() + 60
-    while alive(pid) and time.monotonic() < until:
-        time.sleep(0.02)
-    return not alive(pid)
 
 
 @pytest.fixture

@@ -303,6 +303,7 @@ def test_noise_is_the_same_in_all_renders_in_a_call_or_in_none(variant) -> None:
     assert len({tuple(one.flatten().tolist()) for one in point}) == 4
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_workers_do_not_repeat_the_noise_of_each_other() -> None:
     """The first renders of two workers and of this process, of 48 noisy values each; fixed noise is the same in all."""
     x = torch.full((1, 3), 0.5)

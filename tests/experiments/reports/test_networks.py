@@ -11,7 +11,7 @@ from experiments.ensembles.ensemble import Ensemble
 from experiments.problems import catalogue
 from experiments.problems.network_task import Size
 from experiments.problems.tasks import cnn
-from experiments.reports import onnx_export, overview_networks
+from experiments.reports import error_curves, onnx_export, overview_networks, predictions
 from experiments.reports.networks import HELD_OUT, conclude, summary
 from experiments.reports.overview_networks import network_column
 from experiments.reports.trained_network import Result
@@ -25,12 +25,19 @@ def tiny(monkeypatch):
     monkeypatch.setitem(cnn.SIZES, "fast", Size(16, 2, 2, evaluations=84, images=12, held_out=4))
 
 
+def no_files(patched):
+    """Leave out what takes time and has no part in the table: figures and the encoder for ONNX."""
+    patched.setattr(error_curves, "curves", lambda *_: None)
+    patched.setattr(predictions, "draw", lambda *_: None)
+    patched.setattr(onnx_export, "export", lambda *_: 0.0)
+
+
 def ended(folder, methods, runs=2):
     ensemble = Ensemble(folder, range(runs))
     return ensemble.run(ensemble.plan([BUMP], methods))
 
 
-def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, one_process, capsys):
+def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, one_process, capsys, monkeypatch):
     methods = ["our_g", SHIFT]
     outcomes = ended(tmp_path, methods)
     results, folder = conclude(BUMP, outcomes, tmp_path), tmp_path / "bump"
@@ -51,6 +58,7 @@ def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, one_process, c
         assert one.parameter_error[1] == pytest.approx(last["parameter_error"])  # of the weights that were kept
         assert one.evaluations == outcome.evaluations
     logs = {path: path.read_bytes() for path in folder.glob("*/*.jsonl")}
+    no_files(monkeypatch)
     assert summary(BUMP, conclude(BUMP, ended(tmp_path, methods), tmp_path)) == summary(BUMP, results)
     assert {path: path.read_bytes() for path in folder.glob("*/*.jsonl")} == logs  # nothing is trained twice
 
@@ -77,7 +85,8 @@ def test_a_trained_network_has_a_column_in_the_overview(tmp_path, one_process, m
         assert found.caption.startswith(f"{outcome['evaluations']} evaluations, error ")
 
 
-def test_runs_that_fail_are_named_and_left_out(tmp_path, one_process, capsys):
+def test_runs_that_fail_are_named_and_left_out(tmp_path, one_process, capsys, monkeypatch):
+    no_files(monkeypatch)
     outcomes = ended(tmp_path, [SHIFT, FAIL_TO_TRAIN], runs=1)
     assert [one.method for one in conclude(BUMP, outcomes, tmp_path)] == ["shift"]
     assert "bump fail_to_train 0 failed: ZeroDivisionError: as this method does" in capsys.readouterr().out

@@ -1,6 +1,7 @@
 """The cost of the package, run small: which path is timed, and that perturbations that are drawn again are not kept."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -28,11 +29,14 @@ def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
 
 
 @pytest.fixture(scope="module")
-def costs(tmp_path_factory) -> BenchReport:
+def costs(tmp_path_factory, forking) -> BenchReport:
     out = tmp_path_factory.mktemp("bench") / "bench.json"
     before, threads = extension.available, torch.get_num_threads()
     kept = {}
     with pytest.MonkeyPatch.context() as patched:
+        processes = SimpleNamespace(get_context=lambda method: forking)
+        patched.setattr("experiments.studies.bench.multiprocessing", processes)
+        patched.setattr("experiments.studies.bench._SHORTEST", 1e-5)
         patched.setattr("experiments.studies.bench_memory.SIZES", ((1, False), (5, False), (40, False), (40, True)))
         patched.setattr("experiments.studies.bench.may_keep", lambda name: None)
         patched.setattr("experiments.studies.bench.keep", lambda headers, rows, name: kept.update({name: rows}))
@@ -94,6 +98,7 @@ def test_ratios_against_the_machine(costs) -> None:
 
 
 def test_bench_without_the_extension(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("experiments.studies.bench._SHORTEST", 1e-5)
     monkeypatch.setattr(extension, "available", False)
     (timing,) = (
         t

@@ -6,6 +6,7 @@ import pytest
 from document_texts import TEXTS, experiment_calls
 
 from experiments.commands import COMMANDS, call
+from experiments.ensembles import ensemble
 from experiments.problems import catalogue
 from experiments.problems.network_task import NetworkTask, Size
 
@@ -27,6 +28,18 @@ def tiny_networks(monkeypatch):
     monkeypatch.setattr(catalogue, "load", load_tiny)
 
 
+@pytest.fixture
+def few_steps(monkeypatch):
+    """Methods with a memory take no more steps than there are evaluations."""
+    settings = ensemble.settings_of
+
+    def fewer(method, task):
+        steps = {"least_steps": 24} if method in ("memory_newton", "memory_targets") else {}
+        return settings(method, task) | steps
+
+    monkeypatch.setattr(ensemble, "settings_of", fewer)
+
+
 def small(line):
     """Return the command of a line and its arguments, of which later ones win, without storing a table."""
     command, *arguments = shlex.split(line.partition("#")[0])
@@ -35,7 +48,7 @@ def small(line):
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_it_ends_with_a_table(line, tmp_path, capsys, one_process, tiny_networks):
+def test_it_ends_with_a_table(line, tmp_path, capsys, one_process, tiny_networks, few_steps):
     command, arguments = small(line)
     call(command, COMMANDS[command].load(), [*arguments, "--out", str(tmp_path)])
     printed = capsys.readouterr().out

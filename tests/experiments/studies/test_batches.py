@@ -7,6 +7,7 @@ from experiments.reports.tables import table
 from experiments.studies.batches import HEADERS, Search, _rows, batches
 
 
+@pytest.mark.usefixtures("quick_workers")
 def test_larger_batches_take_fewer_rounds_and_workers_change_nothing(capsys):
     alone, four, spread = batches(("box2",), sizes=(1, 4), workers=1, runs=2, seed=1000)
     assert [(row.task, row.batch, row.workers, row.runs) for row in (alone, four, spread)] == [

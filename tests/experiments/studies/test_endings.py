@@ -11,8 +11,7 @@ from experiments.studies import endings as module
 from experiments.studies.endings import CONVEX, HEADERS, METHODS, End, ended, endings, row
 
 
-@pytest.mark.parametrize("box", [False, True])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("method", "box"), [(method, number % 2 > 0) for number, method in enumerate(METHODS)])
 def test_every_method_ends_at_the_minimum(method, box):
     function, start = functions(2, 3)["logistic regression"], torch.tensor([1.5, -0.5], dtype=torch.float64)
     counted, calls = counting(function)

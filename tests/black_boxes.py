@@ -3,7 +3,6 @@
 import copy
 import os
 import signal
-import subprocess
 import time
 import types
 import zlib
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torch_zerohess.adapters import server
 from torch_zerohess.evaluators.process_identity import own_seed
 from torch_zerohess.evaluators.transfer import packed, unpacked
 
@@ -269,23 +267,6 @@ def with_processes(z):
     """Sums [K], by a process of its own."""
     loader = torch.utils.data.DataLoader(z, batch_size=len(z), num_workers=1)
     return next(iter(loader)).sum(1)
-
-
-def set_clock(set_attribute, path):
-    """Let limits of programs be over as soon as something is written in a file, and not before."""
-    real = time.monotonic
-
-    def clock() -> float:
-        return real() + 1e9 if path.exists() and path.read_text().strip() else 0.0
-
-    set_attribute(server, "time", types.SimpleNamespace(monotonic=clock))
-    set_attribute(subprocess, "_time", clock)
-
-
-def with_clock(path, program):
-    """Return a program, for a worker of its own, after `set_clock` in it."""
-    set_clock(setattr, path)
-    return program
 
 
 GENERATOR = np.random.default_rng(0)

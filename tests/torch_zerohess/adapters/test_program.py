@@ -17,12 +17,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from black_boxes import set_clock, with_clock
 
 import torch_zerohess as zh
 from torch_zerohess.adapters import server as servers
 from torch_zerohess.adapters.process import Program
-from torch_zerohess.evaluators import Executor, Factory, ProcessPool
+from torch_zerohess.evaluators import Executor, ProcessPool
 from torch_zerohess.evaluators.partial_values import finished_values
 from truths import vector
 
@@ -139,9 +138,14 @@ WRITES = "open(__import__('os').environ['NOTE'], 'w').write('1')"
 @pytest.fixture
 def note(tmp_path, monkeypatch):
     """A file in the environment. No limit of this process is over before a program has written to it."""
-    path = tmp_path / "note"
+    path, real = tmp_path / "note", time.monotonic
+
+    def clock() -> float:
+        return real() + 1e9 if path.exists() and path.read_text().strip() else 0.0
+
     monkeypatch.setenv("NOTE", str(path))
-    set_clock(monkeypatch.setattr, path)
+    monkeypatch.setattr(servers, "time", SimpleNamespace(monotonic=clock))
+    monkeypatch.setattr(subprocess, "_time", clock)
     return path
 
 
@@ -226,16 +230,17 @@ def test_programs_that_the_program_started_end_with_it(note, command, settings):
     program.close()
 
 
-@pytest.mark.usefixtures("quick_workers")
 def test_in_a_worker_too(tmp_path):
-    late, other = tmp_path / "late", tmp_path / "other"
-    program = Program(STARTS, timeout=1.0, environment={"NOTE": str(late)}, on_failure="nan")
+    note = tmp_path / "note"
+    program = Program(STARTS, timeout=10.0, environment={"NOTE": str(note)}, on_failure="nan")
     with ProcessPool(1) as pool:
-        assert pool(Factory(with_clock, late, program), Z[:1]).isnan().all()
-        assert has_ended(noted(late))
-        with pytest.raises(KeyboardInterrupt), interrupted(other):
-            pool(Program(STARTS, timeout=60.0, environment={"NOTE": str(other)}), Z[:1])
-    assert has_ended(noted(other))
+        assert pool(program, Z[:1]).isnan().all()
+        assert has_ended(noted(note))
+        program.timeout = 60.0
+        note.unlink()
+        with pytest.raises(KeyboardInterrupt), interrupted(note):
+            pool(program, Z[:1])
+    assert has_ended(noted(note))
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from experiments.problems import smooth_losses
 from experiments.problems.smooth_losses import FUNCTIONS, NAMES, TARGETS, functions, lowest, minimizer, task
 
 CONVEX = NAMES[:-1]
@@ -43,24 +42,6 @@ def test_slopes_are_zero_at_minima(name, n):
     function = functions(n, 2)[name]
     slope = torch.func.grad(lambda z: function(z[None])[0])
     assert float(slope(minimizer(function, n)).norm()) < 1e-7 * float(slope(torch.full((n,), 3.0).double()).norm())
-
-
-def test_steps_that_come_again_are_not_made_again(monkeypatch):
-    """Rounding leads back to an earlier point. The bits are those of all steps, whatever their number."""
-    function, x = functions(2, 2)["log-sum-exp"], torch.zeros(2, dtype=torch.float64)
-
-    def loss(z):
-        return function(z[None])[0]
-
-    for number in range(1, 41):
-        curvatures, axes = torch.linalg.eigh(torch.func.hessian(loss)(x))
-        step = axes @ ((axes.mT @ torch.func.grad(loss)(x)) / curvatures.abs())
-        while float(loss(x - step)) > float(loss(x)) and float(step.norm()) > 1e-12:
-            step = 0.5 * step
-        x = x - step
-        if number > 37:
-            monkeypatch.setattr(smooth_losses, "_STEPS", number)
-            assert torch.equal(minimizer(function, 2), x)
 
 
 @pytest.mark.parametrize("number", FUNCTIONS)

@@ -65,13 +65,7 @@ def region_step(
     u, held = torch.zeros_like(gradient), torch.zeros_like(most, dtype=torch.bool)
     lowest, least = u, torch.inf
     while True:
-        across, sizes, along = torch.linalg.svd(rows[held])
-        count, sizes = len(sizes), sizes.clamp_min(_BEYOND)  # rows may depend on each other
-        end = along[:count].mT @ (across[:, :count].mT @ most[held] / sizes)  # the nearest point to the region's center
-        free, left = along[count:].mT, 1.0 - float(end @ end)
-        if free.shape[1] and left > 0.0:
-            slope, bend = free.mT @ (gradient + hessian @ end), free.mT @ hessian @ free
-            end = end + free @ ball_step(slope, bend, left**0.5, singular)
+        end = _least_where(rows[held], most[held], gradient, hessian, singular)
         ahead = torch.where(held, 0.0, rows @ (end - u))
         part = torch.where(ahead > _BEYOND, (most - rows @ u).clamp_min(0.0) / ahead, torch.inf)
         if bool((part < 1.0).any()):
@@ -91,3 +85,20 @@ def region_step(
             break
         held[held.nonzero()[int(multipliers.argmin()), 0]] = False
     return (root @ lowest).clamp(lower, upper)
+
+
+def _least_where(rows: Tensor, most: Tensor, gradient: Tensor, hessian: Tensor, singular: float) -> Tensor:
+    """Return u [n] that minimises gradient.u + u.hessian u/2 within |u| <= 1 where rows @ u = most.
+
+    If there is none, the nearest point to 0 with these equations.
+    """
+    if not len(rows):
+        return 0.0 + ball_step(0.0 + gradient, 0.0 + hessian, 1.0, singular)  # no -0.0, as if by products with 1 and 0
+    across, sizes, along = torch.linalg.svd(rows)
+    count, sizes = len(sizes), sizes.clamp_min(_BEYOND)  # rows may depend on each other
+    end = along[:count].mT @ (across[:, :count].mT @ most / sizes)
+    free, left = along[count:].mT, 1.0 - float(end @ end)
+    if free.shape[1] and left > 0.0:
+        slope, bend = free.mT @ (gradient + hessian @ end), free.mT @ hessian @ free
+        end = end + free @ ball_step(slope, bend, left**0.5, singular)
+    return end

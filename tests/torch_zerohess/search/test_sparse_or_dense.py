@@ -154,7 +154,7 @@ def test_the_value_is_one_of_the_best_point_also_after_a_change(dead):
     loss = square(some(1.0 + normal(1, n))[0])
     search = door(n + dead, loss)
     engines_seen = set()
-    while search.evaluations < 300 and not search.done:
+    while search.evaluations < 200 and not search.done:
         search.tell(some(search.ask()))
         engines_seen.add(search.engine)
         assert search.value == pytest.approx(float(loss(some(search.x[None])[0])), rel=1e-9)

@@ -43,8 +43,7 @@ def test_squares_of_distances_in_a_very_wide_box_do_not_overflow(loss):
         TrustRegion(zeros(1), sigma=1.0, bounds=(-1e200, 1e200), loss=loss, engine="gaussian_process")
 
 
-@pytest.mark.parametrize("with_loss", [False, True])
-@pytest.mark.parametrize("n", [2, 5])
+@pytest.mark.parametrize(("n", "with_loss"), [(2, True), (5, False), (5, True)])
 @pytest.mark.parametrize(("engine", "kind"), [("descent", Descent), ("gaussian_process", GaussianProcessSearch)])
 def test_the_engine_may_be_chosen_and_is_that_class(engine, kind, n, with_loss):
     """The same points to the last bit, also beyond the number of parameters up to which a process is the choice."""

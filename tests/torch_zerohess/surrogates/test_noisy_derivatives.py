@@ -1,6 +1,5 @@
 """Derivatives from noisy values against dense formulas of universal kriging, and against functions that are known."""
 
-import itertools
 import math
 
 import pytest
@@ -83,7 +82,7 @@ def test_choices_have_the_evidence_of_universal_kriging(monkeypatch):
     """Up to a constant, and the prior."""
     u = normal(25, 2)
     change, found, truth = torch.sin(2 * u).sum(1) + 0.05 * normal(25, seed=1), [], []
-    for kernel, length, ratio in itertools.product((0, 1), (0.5, 2.0), (1.0, 100.0)):
+    for kernel, length, ratio in ((0, 0.5, 1.0), (0, 2.0, 100.0), (1, 0.5, 100.0), (1, 2.0, 1.0)):
         with monkeypatch.context() as patch:
             choose(patch, kernel, length, ratio)
             prior = 6 * math.log(min(length, 1.0)) - 0.1 * math.log(ratio)
@@ -108,7 +107,7 @@ def test_the_choices_are_averaged(monkeypatch):
     torch.testing.assert_close(torch.cat([slope, bend]), size * mixture.sqrt()[[1, 2, 3, 5]])
 
 
-def scores(function, hessian, runs=16, count=60):
+def scores(function, hessian, runs, count=60):
     """Errors of gradient and Hessian diagonal at 0 over their standard errors [runs, 4], and the latter [runs, 4].
 
     Args:
@@ -131,13 +130,11 @@ def scores(function, hessian, runs=16, count=60):
 @pytest.mark.parametrize(
     "function",
     [
-        lambda z: z.square().sum(1),
         lambda z: z.square().sum(1) + 0.5 * z.pow(3).sum(1),
-        lambda z: z.square().sum(1) + z.pow(4).sum(1),
         lambda z: 2 * z.cosh().sum(1) - z.square().prod(1),
         lambda z: 0.5 * (2 * z).sin().square().sum(1) - z.square().sum(1),
     ],
-    ids=["quadratic", "cubic", "quartic", "cosh", "sine"],
+    ids=["cubic", "cosh", "sine"],
 )
 def test_twice_the_standard_error_covers_the_derivatives(function):
     """Also of functions that are no quadratic: a least-squares quadratic is off by many of its errors there."""
@@ -162,7 +159,7 @@ def test_parameters_have_widths_of_their_own():
     """One changes the function over a distance of 1, the other over 1/300; so are the points."""
     scale = torch.tensor([1.0, 300.0], dtype=torch.float64)
     generator, inside = torch.Generator().manual_seed(0), []
-    for _ in range(12):
+    for _ in range(8):
         points = torch.randn(100, 2, generator=generator, dtype=torch.float64) / scale
         values = 2 * (points * scale - 0.2).cosh().log().sum(1)
         values += NOISE * torch.randn(100, generator=generator, dtype=torch.float64)
@@ -191,7 +188,7 @@ def test_many_values_are_thinned_and_cover_the_same_region(monkeypatch, n):
 
 def test_values_far_away_do_not_spoil_the_derivatives():
     """Values up to 1e6 where the noise is 0.1: all together leave an error of 80, the nearest ones of 2."""
-    found, sizes = scores(lambda z: (6 * z).cosh().sum(1) / 18, 2.0, count=160)
+    found, sizes = scores(lambda z: (6 * z).cosh().sum(1) / 18, 2.0, runs=8, count=160)
     assert float((found.abs() < 2).double().mean()) > 0.85
     assert float(sizes[:, 2:].median()) < 5.0
 
@@ -262,17 +259,17 @@ def test_a_change_is_that_of_universal_kriging(monkeypatch, kernel):
 
 
 def test_changes_between_points_and_their_errors():
-    """Over 40 sets of values of cosh, (change - truth) / error has size 1; nearer points are known better."""
+    """Over 20 sets of values of cosh, (change - truth) / error has size 1; nearer points are known better."""
     generator, scores, errors = torch.Generator().manual_seed(0), [], []
     others = torch.tensor([[0.1, 0.0], [0.5, -0.3], [-1.0, 0.4]], dtype=torch.float64)
-    for _ in range(40):
+    for _ in range(20):
         points = torch.randn(60, 2, generator=generator, dtype=torch.float64)
         values = points.cosh().sum(1) + NOISE * torch.randn(60, generator=generator, dtype=torch.float64)
         change, error = noisy_changes(points.new_zeros(2), others, points, values, NOISE)
         scores.append((change - (others.cosh().sum(1) - 2.0)) / error)
         errors.append(error)
     rms = torch.stack(scores).square().mean(0).sqrt()
-    assert bool((rms < 1.0 + 5 / math.sqrt(2 * 40)).all())
+    assert bool((rms < 1.0 + 5 / math.sqrt(2 * 20)).all())
     assert bool((rms > 0.3).all())
     assert torch.stack(errors).median(0).values.argsort().tolist() == [0, 1, 2]
 

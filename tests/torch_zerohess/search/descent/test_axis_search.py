@@ -37,10 +37,13 @@ def start(n: int, seed: int = 0) -> Tensor:
     return torch.empty(n).uniform_(-4.0, 4.0, generator=torch.Generator().manual_seed(seed))
 
 
-def stages(search, f, most: int) -> list[tuple[str, int]]:
-    """Evaluate so many points; return the stages of the search along the axes, and the evaluations in each."""
+def stages(search, f, most: int, target: float = -math.inf) -> list[tuple[str, int]]:
+    """Evaluate so many points, or until a value; return the stages of the search along the axes, and how many in each.
+
+    Numbers are of evaluations.
+    """
     met: list[tuple[str, int]] = []
-    while search.evaluations < most and not search.done:
+    while search.evaluations < most and not search.done and search.value > target:
         lines = search._state.progress.lines
         stage = "" if lines is None else lines.stage
         z = search.ask()
@@ -51,10 +54,10 @@ def stages(search, f, most: int) -> list[tuple[str, int]]:
 
 @pytest.mark.parametrize(("kind", "n"), SEARCHES)
 def test_the_lowest_of_many_minima_is_found_where_the_loss_is_a_sum(kind, n) -> None:
-    for seed in range(3):
+    for seed in range(2):
         search = kind(start(n, seed), sigma=2.0, bounds=BOX, seed=seed)
-        stages(search, rastrigin, 200 * n)
-        assert search.value < 1e-8
+        stages(search, rastrigin, 200 * n, 1e-8)
+        assert search.value <= 1e-8
 
 
 @pytest.mark.parametrize(("engine", "n"), [("descent", 4), ("gaussian_process", 2)])
@@ -67,7 +70,7 @@ def test_where_nothing_is_lower_along_the_axes_the_search_ends(engine, n) -> Non
 
 @pytest.mark.parametrize(("kind", "n"), BOTH)
 def test_another_function_pays_two_evaluations(kind, n) -> None:
-    met = stages(kind(start(n), sigma=2.0, bounds=BOX, seed=0), rotated, 150 * n)
+    met = stages(kind(start(n), sigma=2.0, bounds=BOX, seed=0), rotated, 75 * n)
     assert [stage for stage, _ in met] == ["", "exchanged", "over"]
     assert met[1][1] == 2
 
@@ -94,7 +97,7 @@ def test_a_sum_whose_chord_is_convex_is_searched_where_rounds_arrive_at_several_
 def test_a_loss_that_one_half_of_the_coordinates_does_not_change_is_no_sum(kind) -> None:
     """Exchanging them shows nothing."""
     f = lambda z: rastrigin(z[:, :1]) * (1.0 + z[:, 1].abs().clamp(max=0.0).double())  # noqa: E731
-    met = stages(kind(start(2), sigma=2.0, bounds=BOX, seed=0), f, 300)
+    met = stages(kind(start(2), sigma=2.0, bounds=BOX, seed=0), f, 200)
     assert "axes" not in [stage for stage, _ in met]
 
 
@@ -108,7 +111,7 @@ def test_a_coordinate_that_is_equal_tells_nothing() -> None:
 
 
 def test_without_a_box_there_are_no_axes_to_search() -> None:
-    met = stages(Descent(start(4), sigma=2.0, bounds=(-5.0, None), seed=0), rastrigin, 400)
+    met = stages(Descent(start(4), sigma=2.0, bounds=(-5.0, None), seed=0), rastrigin, 250)
     assert [stage for stage, _ in met] == [""]
 
 
@@ -116,9 +119,9 @@ def test_without_a_box_there_are_no_axes_to_search() -> None:
 def test_values_that_are_not_finite_count_as_the_highest(kind, n) -> None:
     f = lambda z: torch.where(z[:, 0] < -2.0, math.nan, rastrigin(z))  # noqa: E731
     search = kind(start(n).abs(), sigma=2.0, bounds=BOX, seed=0)
-    met = stages(search, f, 200 * n)
+    met = stages(search, f, 200 * n, 1e-8)
     assert "axes" in [stage for stage, _ in met]
-    assert search.value < 1e-8
+    assert search.value <= 1e-8
 
 
 def test_a_chord_tells_a_convex_sum_beside_values_that_are_not_finite() -> None:

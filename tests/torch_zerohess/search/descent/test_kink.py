@@ -1,6 +1,6 @@
 """Descent on a loss with kinks."""
 
-import statistics
+import functools
 from dataclasses import replace
 
 import pytest
@@ -37,9 +37,9 @@ def test_a_kink_is_no_minimum(n, largest, seed) -> None:
     assert not fit.success or fit.value < 0.01 * start
 
 
-@pytest.mark.parametrize("n", [1, 2, 4])
+@pytest.mark.parametrize("n", [1, 3])
 def test_a_kink_may_be_a_minimum(n) -> None:
-    for seed in range(3):
+    for seed in range(4 // n):
         fit = zh.minimize(lambda z: (z - 0.3).abs().sum(1), [0.9] * n, sigma=0.5, restarts=0, seed=seed)
         assert (fit.status, fit.success) == ("solved", True)
         assert fit.value < 1e-4
@@ -48,10 +48,8 @@ def test_a_kink_may_be_a_minimum(n) -> None:
 @pytest.mark.parametrize(
     ("f", "weight", "bounds", "start", "least", "excess"),
     [
-        (half_space, 1e2, None, [0.0] * 3, 3.0, 0.006),
         (half_space, 1e4, None, [0.0] * 3, 3.0, 0.006),
         (half_space, 1e4, (-5, 5), [0.0] * 3, 3.0, 0.006),
-        (hyperbola, 1e2, None, [2.0] * 2, 2.0, 0.03),
         (hyperbola, 1e4, None, [2.0] * 2, 2.0, 0.03),
     ],
 )
@@ -59,13 +57,13 @@ def test_along_a_penalty_the_loss_falls(f, weight, bounds, start, least, excess)
     """The slopes on its steep side are thousands of times as long as those on the other side."""
     values = []
     target = least + min(excess, 0.01)
-    for seed in range(5):
+    for seed in range(3):
         settings = {"sigma": 0.5, "seed": seed, "restarts": 0, "max_evaluations": 600, "bounds": bounds}
         settings["target"] = target  # no false claim is left below it
         fit = zh.minimize(lambda z: f(z, weight), torch.tensor(start).double(), **settings)
         assert not fit.success or fit.value < least + 0.01
         values.append(fit.value - least)
-    assert sorted(values)[2] < excess
+    assert sorted(values)[1] < excess
 
 
 def ball(z: Tensor, weight: float) -> Tensor:
@@ -93,9 +91,13 @@ def test_a_penalty_of_many_parameters_makes_no_false_claim(f, seed) -> None:
 
 
 def test_long_steps_follow_a_kink() -> None:
-    settings = {"sigma": 0.5, "restarts": 0, "max_evaluations": 960}
-    fits = [zh.minimize(lambda z: plane(z, 100.0), torch.zeros(12).double(), seed=k, **settings) for k in range(5)]
-    assert statistics.median(fit.value for fit in fits) < _least_of_plane(12) + 0.06
+    """From most of five starts."""
+    settings = {"sigma": 0.5, "restarts": 0, "max_evaluations": 960, "target": _least_of_plane(12) + 0.06}
+    reached = missed = 0
+    while max(reached, missed) < 3:
+        fit = zh.minimize(lambda z: plane(z, 100.0), torch.zeros(12).double(), seed=reached + missed, **settings)
+        reached, missed = reached + (fit.status == "target"), missed + (fit.status != "target")
+    assert reached == 3
 
 
 def test_differences_across_a_kink_tell_no_slope() -> None:
@@ -132,12 +134,11 @@ def test_zero_is_small_beside_the_shortest_slope() -> None:
 
 
 def test_a_penalty_may_have_its_minimum_at_the_kink() -> None:
-    for seed in range(3):
-        fit = zh.minimize(
-            lambda z: z.square().sum(1) + 100 * z[:, 0].clamp(min=0), [0.7, -0.6], sigma=0.5, restarts=0, seed=seed
-        )
-        assert fit.success
-        assert fit.value < 1e-9
+    fit = zh.minimize(
+        lambda z: z.square().sum(1) + 100 * z[:, 0].clamp(min=0), [0.7, -0.6], sigma=0.5, restarts=0, seed=0
+    )
+    assert fit.success
+    assert fit.value < 1e-9
 
 
 def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
@@ -152,22 +153,31 @@ def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
     assert "do not show" in search.message
 
 
-def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
-    """The evaluations end while slopes are measured."""
+def process() -> zh.optim.TrustRegion:
     start = torch.zeros(3).double()
-    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=0, restarts=0)
+    return zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=0, restarts=0)
+
+
+@functools.cache
+def state_where_a_process_measures_slopes() -> dict[str, object]:
+    search = process()
     while (local := search._state.progress.local) is None or local.slopes is None:
         search.tell(half_space(search.ask(), 1e4))
+    return search.state_dict()
+
+
+def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
+    """The evaluations end while slopes are measured."""
+    search = process()
+    search.load_state_dict(state_where_a_process_measures_slopes())
     search.tell(half_space(search.ask(limit=2), 1e4))
     assert not search.solved
 
 
 def test_a_process_waits_until_slopes_are_measured() -> None:
     """It has no patience left, and the slopes that are measured lower nothing."""
-    start = torch.zeros(3).double()
-    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=0, restarts=0)
-    while (local := search._state.progress.local) is None or local.slopes is None:
-        search.tell(half_space(search.ask(), 1e4))
+    search = process()
+    search.load_state_dict(state_where_a_process_measures_slopes())
     search._state = replace(search._state, progress=replace(search._state.progress, waited=10**6))
     search.tell(half_space(search.ask(), 1e4))
     assert search._state.progress.finishing
@@ -195,7 +205,7 @@ def step(z: Tensor) -> Tensor:
     return z.square().sum(1) + (z[:, 0] > -0.2)
 
 
-@pytest.mark.parametrize(("f", "seeds"), [(valley, 4), (step, 3)])
+@pytest.mark.parametrize(("f", "seeds"), [(valley, 4), (step, 1)])
 def test_one_slope_tells_a_narrow_valley_and_a_jump_from_a_kink(f, seeds) -> None:
     measured = 0
     for seed in range(seeds):

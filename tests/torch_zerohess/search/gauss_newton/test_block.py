@@ -200,7 +200,7 @@ def test_least_squares_on_the_sides_of_a_box_are_solved(seed):
     torch.testing.assert_close(search.x, x, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_mean_of_magnitudes_is_minimised_as_a_whole(seed):
     """Its quadratic is a plane: steps along it end at the first kinks, a tenth of the loss above the minimum."""
     fn = Linear(10, seed, "mean", side=100.0)

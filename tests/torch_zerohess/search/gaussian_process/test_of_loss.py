@@ -16,17 +16,17 @@ from torch_zerohess.search.protocol.state import Evaluated
 from truths import normal, vector
 
 
-def search_for(f, x0, evaluations, **settings):
+def search_for(f, x0, evaluations, target=-torch.inf, **settings):
     search = GaussianProcessSearch(x0, **{"restarts": 100, **settings})
-    while search.evaluations < evaluations and not search.done:
+    while search.evaluations < evaluations and search.value > target and not search.done:
         search.tell(f(search.ask()))
     return search
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_it_crosses_a_plateau_and_leaves_a_local_minimum(seed):
-    search = search_for(well, vector(-2.0, 1.5), 200, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
-    assert search.value < 1e-6
+    search = search_for(well, vector(-2.0, 1.5), 200, 1e-6, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
+    assert search.value <= 1e-6
     assert torch.allclose(search.x, vector(2.0, -2.0), atol=1e-3)
 
 
@@ -38,8 +38,9 @@ def test_a_paraboloid_is_solved_to_the_last_digit(condition, seed):
     def bowl(z):
         return (z - vector(0.7, -1.2)).square() @ vector(1.0, condition)
 
-    search = search_for(bowl, vector(-2.0, 2.0), 80, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
-    assert search.value < 1e-12 * condition
+    target = 1e-12 * condition
+    search = search_for(bowl, vector(-2.0, 2.0), 80, target, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
+    assert search.value <= target
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -63,7 +64,7 @@ def test_it_follows_a_curved_valley(seed):
     def rosenbrock(z):
         return (1 - z[:, 0]).square() + 100 * (z[:, 1] - z[:, 0].square()).square()
 
-    search = search_for(rosenbrock, vector(-1.2, 1.0), 250, sigma=0.5, bounds=(-2.0, 2.0), seed=seed)
+    search = search_for(rosenbrock, vector(-1.2, 1.0), 250, 1e-5, sigma=0.5, bounds=(-2.0, 2.0), seed=seed)
     assert torch.allclose(search.x, vector(1.0, 1.0), atol=1e-2)
 
 
@@ -74,8 +75,8 @@ def test_it_leaves_a_plateau_that_is_exactly_flat(seed):
     def hole(z):
         return ((z - 9.0).square().sum(1) / 9.0).clamp(max=1.0)
 
-    search = search_for(hole, vector(-9.0, -9.0), 150, sigma=1.0, bounds=(-12.0, 12.0), seed=seed)
-    assert search.value < 1e-6
+    search = search_for(hole, vector(-9.0, -9.0), 150, 1e-6, sigma=1.0, bounds=(-12.0, 12.0), seed=seed)
+    assert search.value <= 1e-6
 
 
 @pytest.mark.parametrize("n", [1, 3, 4])
@@ -121,7 +122,7 @@ def test_derivatives_at_the_minimum_are_those_of_the_loss():
 def test_noise_is_averaged():
     generator = torch.Generator().manual_seed(0)
     errors = []
-    for seed in range(6):
+    for seed in range(4):
 
         def noisy(z):
             clean = (z - 0.5).square().sum(1)
@@ -131,7 +132,7 @@ def test_noise_is_averaged():
         errors.append(float(search.x - 0.5))
         # The lowest of 40 values around the minimum is 0.2 below the truth.
         assert abs(search.value) < 0.1
-    assert sum(one**2 for one in errors) / 6 < 0.15**2
+    assert sum(one**2 for one in errors) / 4 < 0.15**2
 
 
 def test_it_ends_after_its_rounds_and_says_why():
@@ -215,7 +216,7 @@ def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
         return torch.minimum(wide, narrow)
 
     higher = 0
-    for seed in range(3):
+    for seed in range(2):
         search = GaussianProcessSearch(vector(-2.0, -2.0), sigma=0.5, bounds=(-4.0, 4.0), restarts=10**6, seed=seed)
         while search.evaluations < 120:
             before = search.state_dict()["progress"]
@@ -240,7 +241,7 @@ def turns_of_quadratics(evaluations):
 
 
 def test_a_search_whose_arrivals_disagree_hops_every_other_time():
-    starts = [after for before, after in turns_of_quadratics(500) if after.finishing and not before.finishing]
+    starts = [after for before, after in turns_of_quadratics(300) if after.finishing and not before.finishing]
     beside = [one.beside for one in starts]
     assert sum(beside) > 3
     assert not any(one and other for one, other in itertools.pairwise(beside))
@@ -253,7 +254,7 @@ def test_a_search_whose_arrivals_disagree_hops_every_other_time():
 def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch):
     """They fall back into its basin, and hardly any others find it."""
     monkeypatch.setattr(of_loss, "_HOPS", (1e-3, 2e-3))
-    ends = [after for before, after in turns_of_quadratics(300) if before.finishing and not after.finishing]
+    ends = [after for before, after in turns_of_quadratics(240) if before.finishing and not after.finishing]
     agreed = [one.agreed for one in ends if one.beside]
     assert len(agreed) > 3
     assert max(agreed) == 0

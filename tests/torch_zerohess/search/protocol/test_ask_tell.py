@@ -24,7 +24,7 @@ from truths import vector
 @every_search
 def test_asking_changes_nothing(name):
     search, f = make(name), black_box(name)
-    for _ in range(40):
+    for _ in range(20):
         before = search.state_dict()
         points = search.ask()
         assert torch.equal(search.ask(), points)
@@ -54,7 +54,7 @@ def test_values_may_be_a_list_of_rows(kind):
 @every_search
 def test_looking_at_the_model_changes_nothing(name):
     search, f = make(name), black_box(name)
-    for _ in range(30):
+    for _ in range(15):
         before = search.state_dict()
         search.model_at_best()
         assert same(search.state_dict(), before)
@@ -95,7 +95,7 @@ def test_the_best_point_is_the_lowest_of_samples_and_steps(name):
         assert torch.equal(search.x, points[values.index(min(values))])
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(
     st.integers(1, 4),
     st.integers(0, 10**6),
@@ -129,10 +129,10 @@ def test_never_outside_of_the_bounds(n, seed, dtype, size, narrow, with_loss, ki
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_bounds_are_kept_to_the_last_bit(dtype):
-    """Minima in corners of 100 random boxes; (bound / sigma) sigma is not always the bound."""
+    """Minima in corners of 40 random boxes; (bound / sigma) sigma is not always the bound."""
     generator = torch.Generator().manual_seed(0)
     at_bounds = 0
-    for seed in range(100):
+    for seed in range(40):
         lower, width, sigma, side = torch.rand(4, 4, generator=generator, dtype=torch.float64) + 0.1
         upper = lower + width
         side = torch.where(side > 0.6, 1.0, -1.0)
@@ -147,7 +147,7 @@ def test_bounds_are_kept_to_the_last_bit(dtype):
             at_bounds += int(((z - lower).abs() < 1e-6).sum() + ((z - upper).abs() < 1e-6).sum())
         assert bool((search.x.double() >= lower).all())
         assert bool((search.x.double() <= upper).all())
-    assert at_bounds > 500
+    assert at_bounds > 200
 
 
 def test_sigma_is_at_most_the_distance_between_the_bounds():
@@ -180,8 +180,9 @@ def test_asking_for_fewer():
     assert run(search, bowl, 37).evaluations == 37
 
 
-@every_search
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("name", "dtype"), [*[(name, torch.float32) for name in SEARCHES], ("descent of the loss", torch.float64)]
+)
 def test_types(name, dtype):
     kind, n, with_loss = SEARCHES[name]
     loss = loss_of(name)
@@ -236,13 +237,13 @@ def test_the_callers_tensors_are_not_held(name):
 def test_the_same_seed_gives_the_same_points_whatever_the_global_generator(name):
     f = black_box(name)
     torch.manual_seed(1)
-    one = points_of(make(name, seed=5), f, 40)
+    one = points_of(make(name, seed=5), f, 25)
     torch.manual_seed(2)
     before = torch.get_rng_state()
-    two = points_of(make(name, seed=5), f, 40)
+    two = points_of(make(name, seed=5), f, 25)
     assert torch.equal(one, two)
     assert torch.equal(before, torch.get_rng_state())
-    assert not torch.equal(one, points_of(make(name, seed=6), f, 40))
+    assert not torch.equal(one, points_of(make(name, seed=6), f, 25))
 
 
 def test_without_a_seed_the_global_generator_decides():
@@ -258,9 +259,9 @@ def test_a_sigma_per_parameter_is_a_change_of_units():
     """By powers of two, so that no bit is lost."""
     units = vector(2.0**-20, 1.0, 2.0**30)
     for kind in (Descent, GaussianProcessSearch):
-        plain = points_of(kind(zeros(3), sigma=1.0, bounds=(-2.0, 3.0), seed=0), rosenbrock, 60)
+        plain = points_of(kind(zeros(3), sigma=1.0, bounds=(-2.0, 3.0), seed=0), rosenbrock, 40)
         scaled = kind(zeros(3), sigma=units, bounds=(-2.0 * units, 3.0 * units), seed=0)
-        assert torch.equal(points_of(scaled, lambda z: rosenbrock(z / units), 60), plain * units)
+        assert torch.equal(points_of(scaled, lambda z: rosenbrock(z / units), 40), plain * units)
 
 
 SETTINGS = [
@@ -317,7 +318,7 @@ def test_a_loss_that_raises_once_changes_nothing(name):
     loss = loss_of(name) or rays_loss(n)
     search = make(name, loss=lambda y: loss(failing(y)))
     other, failures = make(name), 0
-    for _ in range(10):
+    for _ in range(6):
         points = search.ask()
         values, before = black_box(name)(points), search.state_dict()
         for call in range(1, 1000):

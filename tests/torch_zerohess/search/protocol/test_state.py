@@ -18,10 +18,10 @@ from truths import vector
 
 @every_search
 def test_it_resumes_bit_by_bit_at_every_step(name):
-    """In 40 steps, and until the first round has ended."""
+    """In 25 steps, and until the first round has ended."""
     search, f = make(name, seed=3, tolerance=0.2), black_box(name)
     steps = 0
-    while steps < 40 or search.rounds == 0:
+    while steps < 25 or search.rounds == 0:
         steps += 1
         assert steps <= 120
         copy = make(name, seed=99, tolerance=0.2)
@@ -53,7 +53,7 @@ def test_values_told_late_and_out_of_order_change_nothing(name):
     """One point at a time, in any order, saved and loaded in between: the states of one that is told all at once."""
     search, late, f = make(name, seed=3), make(name, seed=3), black_box(name)
     chance = random.Random(0)
-    for _ in range(12):
+    for _ in range(8):
         points = search.ask()
         values = f(points)
         assert torch.equal(late.ask(), points)

@@ -75,8 +75,9 @@ def ball(n, generator):
 )
 def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
     """From most starts: where the border is learned slowly, the evaluations may be used up."""
-    found = 0
-    for seed in range(4):
+    found = seed = 0
+    while found < 3:
+        assert seed < 4
         generator = np.random.default_rng(seed)
         allowed, f, least = problem(n, generator)
         x0 = next(x for _ in range(1000) if allowed(x := generator.uniform(-1.5, 1.5, n)))
@@ -89,21 +90,19 @@ def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
         fit = zh.minimize(fn, x0, bounds=bounds, **settings)
         assert allowed(fit.x.numpy())
         assert fit.value >= least * (1.0 - 1e-9)
-        found += fit.value <= near
-    assert found >= 3
+        found, seed = found + (fit.value <= near), seed + 1
 
 
-@pytest.mark.parametrize("bounds", [None, (-1.0, 3.0)], ids=["descent", "gaussian_process"])
-@pytest.mark.parametrize("seed", range(2))
-def test_a_minimum_in_a_corner_is_found(seed, bounds):
+@pytest.mark.parametrize(("bounds", "seed"), [(None, 0), ((-1.0, 3.0), 1)], ids=["descent", "gaussian_process"])
+def test_a_minimum_in_a_corner_is_found(bounds, seed):
     """2 x + y where x + y >= 1 and x - 2 y >= -1 has its minimum 4/3 at (1/3, 2/3)."""
 
     def fn(z):
         allowed = (z.sum(1) >= 1.0) & (z[:, 0] - 2.0 * z[:, 1] >= -1.0)
         return torch.where(allowed, 2.0 * z[:, 0] + z[:, 1], torch.nan)
 
-    fit = zh.minimize(fn, [2.0, 1.0], sigma=1.0, bounds=bounds, seed=seed, max_evaluations=200)
-    assert fit.evaluations == 200
+    fit = zh.minimize(fn, [2.0, 1.0], sigma=1.0, bounds=bounds, seed=seed, max_evaluations=150)
+    assert fit.evaluations == 150
     assert 4.0 / 3.0 <= fit.value < 4.0 / 3.0 + 1e-3
 
 

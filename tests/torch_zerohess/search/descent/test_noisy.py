@@ -37,7 +37,7 @@ def ends(f, n, evaluations, seeds=5, start=0.0):
 @pytest.mark.parametrize(("condition", "waves", "most"), [(1.0, 0.0, 0.02), (1e4, 0.0, 0.05), (1e6, 0.2, 0.1)])
 def test_a_valley_in_noise(condition, waves, most):
     """Losses up to 1e8, noise of 1, five parameters. In isotropic regions the waves hide the valley: it ends at 1e3."""
-    assert statistics.median(ends(valley(5, condition, waves), 5, 800, start=-4.0)) < most
+    assert statistics.median(ends(valley(5, condition, waves), 5, 800, seeds=3, start=-4.0)) < most
 
 
 def test_a_loss_that_is_far_steeper_on_one_side_of_its_minimum():
@@ -48,13 +48,13 @@ def test_a_loss_that_is_far_steeper_on_one_side_of_its_minimum():
         y = (z - 1.0) @ axes
         return (torch.where(y > 0.0, 100.0, 1.0) * y).square().sum(1)
 
-    assert statistics.mean(ends(f, 2, 300, seeds=12, start=-2.0)) < 0.2
+    assert statistics.mean(ends(f, 2, 300, seeds=6, start=-2.0)) < 0.2
 
 
 def test_more_evaluations_are_averaged():
     """Four times the evaluations at least halve the loss, which is a quarter if errors fall as one over the root."""
     f = valley(3, 10.0)
-    few, many = (statistics.mean(ends(f, 3, count, seeds=12)) for count in (100, 400))
+    few, many = (statistics.mean(ends(f, 3, count, seeds=8)) for count in (100, 400))
     assert many < 0.5 * few
 
 

@@ -349,7 +349,7 @@ def test_the_border_of_a_region_that_fails_is_no_minimum_that_rounds_confirm():
     def f(x):
         return math.nan if float(x.sum()) > 1.2 else float((x - 1.0).square().sum())
 
-    fit = zh.minimize(f, zeros(2), sigma=0.5, max_evaluations=120, vectorized=False, seed=0)
+    fit = zh.minimize(f, zeros(2), sigma=0.5, max_evaluations=250, vectorized=False, seed=3)
     assert fit.status == "budget"
     assert "fails next to x" in fit.message
 

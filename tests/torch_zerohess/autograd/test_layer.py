@@ -344,7 +344,7 @@ def test_seed() -> None:
         ("random", 200, True, 20),
         ("random", 200, False, 1),
         ("random", 200, False, 20),
-        ("sobol", 100, True, 8),
+        ("sobol", 200, True, 8),
         ("orthogonal", 40, True, 1),
     ],
 )

@@ -127,7 +127,7 @@ def test_noise_that_is_absent_at_the_start_is_found():
         assert not reached.success
 
 
-@pytest.mark.parametrize(("engine", "ends"), [("auto", (12, 6)), ("local", (12, 9, 6, 3))])
+@pytest.mark.parametrize(("engine", "ends"), [("auto", (12, 9, 6, 3)), ("local", (12, 9, 6, 3))])
 def test_a_search_in_noise_goes_on_from_x(engine, ends, tmp_path) -> None:
     """Pixels have noise in proportion to them, and a dark picture has none. The search is interrupted near its end."""
     t = torch.linspace(0, 1, 20).double()

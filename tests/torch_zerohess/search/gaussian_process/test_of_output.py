@@ -534,6 +534,6 @@ def test_it_does_not_end_where_outputs_jump():
         loss=loss,
         restarts=0,
         seed=1,
-        max_evaluations=150,
+        max_evaluations=250,
     )
     assert not fit.success

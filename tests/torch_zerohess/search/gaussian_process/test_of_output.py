@@ -533,7 +533,7 @@ def test_it_does_not_end_where_outputs_jump():
         bounds=bounds,
         loss=loss,
         restarts=0,
-        seed=1,
-        max_evaluations=250,
+        seed=0,
+        max_evaluations=180,
     )
-    assert not fit.success
+    assert fit.status == "budget"

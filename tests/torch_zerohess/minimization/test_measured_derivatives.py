@@ -31,7 +31,7 @@ def whole():
 
 @pytest.mark.parametrize(("seed", "restarts"), [(2, None), (8, None), *((seed, 0) for seed in (2, 3, 8, 12, 13, 14))])
 def test_the_covariance_after_a_gaussian_process(seed, restarts):
-    """Within 1e-5 of (J^T J)^-1, and within the error of the Hessian. From the search alone half of these have none."""
+    """Within 1e-5 of (J^T J)^-1, and within two errors of the Hessian. From the search alone half of these have none."""
     fit = fitted(seed, restarts=restarts)
     J = torch.func.jacrev(lambda x: response(x[None])[0])(fit.x) / SPREAD
     assert fit.success
@@ -39,7 +39,7 @@ def test_the_covariance_after_a_gaussian_process(seed, restarts):
     torch.testing.assert_close(fit.covariance().diagonal(), torch.linalg.inv(J.mT @ J).diagonal(), rtol=1e-5, atol=0)
     error = (fit.hessian - J.mT @ J).diagonal().abs()
     assert bool((fit.gradient.abs() < 1e-4 * fit.hessian.diagonal().sqrt()).all())  # x is the minimum
-    assert bool((error < fit.standard_errors["hessian_diagonal"]).all())
+    assert bool((error < 2.0 * fit.standard_errors["hessian_diagonal"]).all())
     assert bool((fit.standard_errors["hessian_diagonal"] < 1e-3 * fit.hessian.diagonal()).all())
 
 

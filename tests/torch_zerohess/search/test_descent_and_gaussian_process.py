@@ -165,7 +165,7 @@ def test_batches_are_served_before_and_after_the_change():
     assert min(sizes) == 4
 
 
-@pytest.mark.parametrize(("n", "seed"), [(5, 3), (5, 0), (6, 6)])
+@pytest.mark.parametrize(("n", "seed"), [(5, 3), (6, 6)])
 def test_the_best_point_is_kept_where_many_points_have_the_least_loss(n, seed, monkeypatch):
     """Gauss-Newton begins at it, in turn with the descent and with the process, also where noise was suspected."""
     places = torch.linspace(0.0, 1.0, 40, dtype=torch.float64)

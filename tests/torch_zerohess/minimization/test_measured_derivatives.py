@@ -31,7 +31,7 @@ def whole():
 
 @pytest.mark.parametrize(("seed", "restarts"), [(2, None), (8, None), *((seed, 0) for seed in (2, 3, 8, 12, 13, 14))])
 def test_the_covariance_after_a_gaussian_process(seed, restarts):
-    """Within 1e-5 of (J^T J)^-1, and within two errors of the Hessian. From the search alone half of these have none."""
+    """Within 1e-5 of (J^T J)^-1, and within two errors of the Hessian. From the search alone half have none."""
     fit = fitted(seed, restarts=restarts)
     J = torch.func.jacrev(lambda x: response(x[None])[0])(fit.x) / SPREAD
     assert fit.success

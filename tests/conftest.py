@@ -40,9 +40,9 @@ def short_climbs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def forking() -> BaseContext:
-    """Of processes that one process forks, which has imported torch once. New ones (spawn) take seconds to import it.
+    """Return a context whose processes are forked by one process that has imported torch.
 
-    Where there is no fork, new ones are made.
+    Processes that are spawned take seconds to import torch. They are spawned where the system has no fork.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")

@@ -93,7 +93,7 @@ def _least_where(rows: Tensor, most: Tensor, gradient: Tensor, hessian: Tensor, 
     If there is none, the nearest point to 0 with these equations.
     """
     if not len(rows):
-        return 0.0 + ball_step(0.0 + gradient, 0.0 + hessian, 1.0, singular)  # no -0.0, as if by products with 1 and 0
+        return 0.0 + ball_step(0.0 + gradient, 0.0 + hessian, 1.0, singular)  # -0.0 is 0.0, as in the sums below
     across, sizes, along = torch.linalg.svd(rows)
     count, sizes = len(sizes), sizes.clamp_min(_BEYOND)  # rows may depend on each other
     end = along[:count].mT @ (across[:, :count].mT @ most / sizes)

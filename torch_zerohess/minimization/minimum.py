@@ -61,9 +61,9 @@ class Minimum:
             too small: they do not include what J^T H J leaves out. They include third derivatives only where a search
             by "gaussian_process" with `loss` has ended by itself. At an active bound few evaluations lie beside x, and
             the Hessian may be wrong by far more than its error. In noise, and up to 40 parameters, about 95 % of
-            derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
-            minimum is a sharp tip that few evaluations resolve. With more parameters, or with fewer than (n + 1)(n +
-            2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.
+            derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the minimum is a sharp tip
+            that few evaluations resolve. With more parameters, or with fewer than (n + 1)(n + 2)/2 + 5 evaluations, the
+            errors are of the search's own model, and often too small.
         sigma: [n], width of the quadratic along every parameter; in noise, the mean distance from x of the evaluations
             that the derivatives were fitted to.
         at_bounds: [n], bools: which parameters of x lie at one of their bounds. The Laplace approximation does not hold

@@ -1,4 +1,4 @@
-"""What `torch.vmap` does with operators that are linear in vectors, given samples: it makes one call of them."""
+"""Batching rules of operators that are linear in vectors: `torch.vmap` makes one call of them for all elements."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -95,7 +95,8 @@ def _directions(rows: Tensor, n: int, smoothing: Smoothing) -> Tensor:
 
     The orthonormal factor of a Gaussian matrix is independent of the lengths of its rows. So each direction is scaled
     by the length of its own row, and every row is N(0, I). A last block of more than n rows has the directions v of a
-    tight frame, which such a factor rotates: as for n orthogonal ones, the mean of v v^T is I / n.
+    tight frame. The orthonormal factor of its first n rows rotates the frame. The mean of v v^T is I / n, as it is for
+    n orthogonal directions.
     """
     plain = rows.clone()
     plain[:, 2], plain[:, 3:] = NORMAL, 0

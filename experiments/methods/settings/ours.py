@@ -25,8 +25,8 @@ LOCAL: dict[str, dict[str, Any]] = {
 """Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
 NETWORKS: dict[str, dict[str, Any]] = {
-    # As many steps as 4 000 renders give. With 400 renders no network stayed on a plateau on runs 200 to 211. With
-    # 2 000 steps run 61 did, after runs 200 to 202 had not: runs 60 to 64 with 400 renders count as tuning.
+    # By hand, with 400 renders: as many steps as 4 000 renders give. No network of runs 200 to 211 stayed on a plateau.
+    # With 2 000 steps the network of run 61 did. So runs 60 to 64 with 400 renders count as tuning.
     "cnn_wide": {
         "memory_newton": {"least_steps": 984},
         "memory_adam": {"least_steps": 984},
